@@ -6,8 +6,6 @@ and a single thread sums a level's gradients.
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import torch
 from torch import Tensor
@@ -33,14 +31,8 @@ def features(positions: Tensor, tangents: Tensor | None, table: Tensor, scales: 
     num_points, num_levels = len(positions), len(scales)
     out = positions.new_empty(num_points, 2 * num_levels)
     rates = None if tangents is None else torch.empty_like(out)
-    arrays = (
-        as_array(positions),
-        as_array(tangents),
-        _levels(table, num_levels),
-        as_array(scales),
-        as_array(out),
-        as_array(rates),
-    )
+    by_level = table.unflatten(0, (num_levels, -1))
+    arrays = list(map(as_array, (positions, tangents, by_level, scales, out, rates)))
     run_ranges(lambda first, last: _fill_features(first, last, *arrays), num_points, _BLOCK)
     return out, rates
 
@@ -64,18 +56,12 @@ def gradients(
     # A part for each level, because the levels are summed at the same time.
     parts = positions.new_empty(num_levels, *positions.shape) if of_positions else None
     tangent_parts = positions.new_empty(num_levels, *positions.shape) if of_positions and tangents is not None else None
-    arrays = (
-        as_array(positions), as_array(tangents), _levels(table, num_levels), as_array(scales), as_array(grad),
-        as_array(grad_rates), _levels(to_table, num_levels), as_array(parts), as_array(tangent_parts),
-    )  # fmt: skip
+    by_level, to_levels = (values.unflatten(0, (num_levels, -1)) for values in (table, to_table))
+    tensors = (positions, tangents, by_level, scales, grad, grad_rates, to_levels, parts, tangent_parts)
+    arrays = list(map(as_array, tensors))
     # The finest level first: its table is the furthest apart in memory, so it takes longest.
     run(lambda level: _add_gradients(level, *arrays), reversed(range(num_levels)))
     return to_table, _sum_of_levels(parts), _sum_of_levels(tangent_parts)
-
-
-def _levels(table: Tensor, num_levels: int) -> Any:
-    """Return the table as an array (levels, size, 2)."""
-    return as_array(table).reshape(num_levels, -1, 2)
 
 
 def _sum_of_levels(parts: Tensor | None) -> Tensor | None:
