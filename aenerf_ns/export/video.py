@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -101,25 +102,18 @@ def sum_recorded_events(events: EventFile, times: NDArray[np.int64]) -> Iterator
 
     The events are read once, in pieces.
     """
-    shape = (events.height, events.width)
-    net = np.zeros(shape, np.int64)
-    index, last = 0, len(times) - 1
-    for chunk in events.chunks():
-        edges = np.searchsorted(chunk.t, times)
-        while index < last:
-            inside = slice(edges[index], edges[index + 1])
+    chunks = events.chunks()
+    chunk = next(chunks, None)
+    for ends in pairwise(times):
+        net = np.zeros((events.height, events.width), np.int64)
+        while chunk is not None:
+            inside = slice(*np.searchsorted(chunk.t, ends))
             np.add.at(net, (chunk.y[inside], chunk.x[inside]), chunk.p[inside])
-            if inside.stop == len(chunk):
-                # The next chunk may continue this interval.
+            if inside.stop < len(chunk):
                 break
-            yield net
-            net = np.zeros(shape, np.int64)
-            index += 1
-        if index == last:
-            return
-    for _ in range(index, last):
+            # The next chunk may continue this interval.
+            chunk = next(chunks, None)
         yield net
-        net = np.zeros(shape, np.int64)
 
 
 class RenderedEvents:
