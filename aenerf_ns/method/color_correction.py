@@ -38,6 +38,10 @@ class NoColorCorrection(nn.Module):
     """
 
     protocol: ClassVar[ColorCorrectionProtocol] = "none"
+    description: ClassVar[str] = "none"
+    """The protocol and what it was fitted on, in words."""
+    fitted_on: ClassVar[str] = "nothing"
+    """The views that the map was fitted on, in words: none."""
 
     def __init__(self, num_channels: int, encoding: ImageEncoding) -> None:
         super().__init__()
@@ -46,16 +50,6 @@ class NoColorCorrection(nn.Module):
     def forward(self, log_radiance: Tensor) -> Tensor:
         """Return display values in [0, 1] (..., channels) for rendered log-radiance (..., channels)."""
         return encode(torch.exp(log_radiance), self.encoding)
-
-    @property
-    def description(self) -> str:
-        """The protocol and what it was fitted on, in words."""
-        return self.protocol
-
-    @property
-    def fitted_on(self) -> str:
-        """The views that the map was fitted on, in words: none."""
-        return "nothing"
 
 
 class AffineColorCorrection(nn.Module):
