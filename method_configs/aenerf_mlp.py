@@ -1,6 +1,6 @@
 """``ns-train aenerf-mlp`` and ``aenerf-mlp-small``: the paper's recipe, on its networks in place of hash grids.
 
-The first has the paper's size, for a GPU and hours; the second is for a CPU and half an hour.
+The first has the paper's size, for a GPU and hours; the second has narrow networks, for a CPU.
 """
 
 from __future__ import annotations
@@ -74,7 +74,6 @@ def _make_small_config() -> AENeRFTrainerConfig:
         xavier_initialization=True,
     )
     model.proposal = ProposalConfig(num_samples_per_ray=(48,), num_hidden_layers=2, hidden_dim=32)
-    model.eval_num_rays_per_chunk = 1 << 13
     for group in ("networks", "proposals"):
         # Narrow networks bear three times the rate.
         config.optimizers[group]["optimizer"].lr = 3e-3

@@ -18,11 +18,11 @@ from tyro._docstrings import get_field_docstring
 from aenerf_ns.dataparsers.formats import FORMATS
 from aenerf_ns.method_configs import peers
 from aenerf_ns.method_configs.aenerf import aenerf, aenerf_small
-from aenerf_ns.method_configs.aenerf_mlp import aenerf_mlp
+from aenerf_ns.method_configs.aenerf_mlp import aenerf_mlp, aenerf_mlp_small
 
 PAGE = Path(__file__).parents[1] / "docs" / "options.md"
 
-METHODS = {method.config.method_name: method.config for method in (aenerf, aenerf_small, aenerf_mlp)}
+METHODS = {method.config.method_name: method.config for method in (aenerf, aenerf_small, aenerf_mlp, aenerf_mlp_small)}
 # Only the options in which they differ from AE-NeRF of the same size are listed.
 PEERS = {
     f"{name}{size}": getattr(peers, f"{name}{size}".replace("-", "_")).config

@@ -51,7 +51,7 @@ def test_wheel_holds_the_package_only(wheel: zipfile.ZipFile) -> None:
 def test_entry_points_exist_in_the_wheel(wheel: zipfile.ZipFile) -> None:
     text = next(wheel.read(name).decode() for name in wheel.namelist() if name.endswith("entry_points.txt"))
     targets = [line.split("=")[1].strip() for line in text.splitlines() if "=" in line]
-    assert len(targets) == 24
+    assert len(targets) == 25
     for target in targets:
         module, attribute = target.split(":")
         assert attribute in wheel.read(module.replace(".", "/") + ".py").decode()

@@ -53,10 +53,10 @@ def read_rows(path: Path, columns: str) -> tuple[list[list[str]], list[str], Tim
         require_utf8(path, bytes(file.buffer.read(64)))
         file.seek(0)
         for number, line in enumerate(file, start=1):
-            # Not within a word, as in the name of a file.
-            text = re.split(r"(?:^|\s)#", line, maxsplit=1)[0]
+            text = line.split("#", 1)[0]
             fields = text.split()
-            if "," in text and (len(fields) != expected or "," in fields[0]):
+            # The comma of 0,5 is left, so that it is named as no number.
+            if "," in text and (len(fields) != expected or re.search(r",(?!\d+$)", fields[0])):
                 fields = [field.strip() for field in text.rstrip().split(",")]
             if not fields or (not rows and len(fields) == expected and TIME_NAME.match(fields[0])):
                 if not rows:

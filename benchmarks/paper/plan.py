@@ -160,7 +160,8 @@ class Plan:
     """Scenes x speeds x methods x seeds."""
 
     scale: Scale = "full"
-    """full: 346 x 260 pixels with aenerf. medium: the same with aenerf-small. tiny, for a CPU: 96 x 72 pixels."""
+    """full: 346 x 260 pixels with aenerf, and aenerf-mlp for the losses. medium: the same with aenerf-small and
+    aenerf-mlp-small. tiny, for a CPU: 96 x 72 pixels."""
     scenes: tuple[str, ...] = ("room", "object")
     """Scenes as aenerf simulate takes them: built-in ones and files."""
     speeds: tuple[Literal["easy", "hard"], ...] = ("easy", "hard")

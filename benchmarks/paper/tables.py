@@ -61,7 +61,7 @@ def report(figures: Sequence[Figures], missing: Mapping[str, str]) -> str:
             poses_table(methods),
         ]
     if losses:
-        parts += ["## Losses (the paper's table 4), hard speed", losses_table(losses)]
+        parts += ["## Losses (the paper's table 4) of the paper's recipe, hard speed", losses_table(losses)]
     if figures:
         parts += ["## Every scene", scenes_table(figures)]
     # Poses that aenerf convert finds by the events have a report, too.

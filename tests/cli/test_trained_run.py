@@ -22,10 +22,10 @@ from aenerf_ns.dataparsers.formats import FORMATS
 from aenerf_ns.dataparsers.own_recording import OwnRecordingDataParserConfig
 from aenerf_ns.errors import DataError
 from aenerf_ns.method_configs.aenerf import aenerf, aenerf_small
-from aenerf_ns.method_configs.aenerf_mlp import aenerf_mlp
+from aenerf_ns.method_configs.aenerf_mlp import aenerf_mlp, aenerf_mlp_small
 from aenerf_ns.method_configs.peers import e2vid_nerf, eventnerf, evnerf, paev3d, robust_enerf
 
-METHODS = (aenerf, aenerf_mlp, aenerf_small, e2vid_nerf, eventnerf, evnerf, paev3d, robust_enerf)
+METHODS = (aenerf, aenerf_mlp, aenerf_mlp_small, aenerf_small, e2vid_nerf, eventnerf, evnerf, paev3d, robust_enerf)
 
 
 def report_of_one(run: Path, output: Path) -> ReportCommand:

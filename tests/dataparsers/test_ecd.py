@@ -52,11 +52,11 @@ def test_ecd_text_reads(tmp_path: Path) -> None:
     assert len(parse(config, "test").image_filenames) == 1
 
 
-def test_names_of_images_hold_a_blank_or_a_hash(tmp_path: Path) -> None:
+def test_names_of_images_hold_a_blank(tmp_path: Path) -> None:
     folder = write_ecd(tmp_path / "made")
     config = EcdDataParserConfig(data=folder)
     names = [name for _, name in (line.split() for line in (folder / "images.txt").read_text().splitlines())]
-    files = [f"view {k}#1.png" for k in range(len(names))]
+    files = [f"view {k}.png" for k in range(len(names))]
     for name, file in zip(names, files, strict=True):
         (folder / name).rename(folder / file)
     lines = [f"0.{k}5,{file}  # a view" for k, file in enumerate(files)]

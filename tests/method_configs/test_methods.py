@@ -20,7 +20,7 @@ from aenerf_ns.dataparsers.native import NativeDataParserConfig
 from aenerf_ns.method.networks import FieldConfig, ProposalConfig
 from aenerf_ns.method_configs import peers
 from aenerf_ns.method_configs.aenerf import aenerf, aenerf_small
-from aenerf_ns.method_configs.aenerf_mlp import aenerf_mlp
+from aenerf_ns.method_configs.aenerf_mlp import aenerf_mlp, aenerf_mlp_small
 from aenerf_ns.training.pipeline import AENeRFPipeline
 
 SMALL = [
@@ -68,8 +68,9 @@ def train(config: TrainerConfig, data: Path, num_steps: int) -> tuple[list[dict[
     return history, pipeline
 
 
-def test_aenerf_mlp_trains_by_the_papers_losses_alone(data: Path) -> None:
-    history, pipeline = train(shrunk(deepcopy(aenerf_mlp.config)), data, 3)
+@pytest.mark.parametrize("config", [shrunk(deepcopy(aenerf_mlp.config)), deepcopy(aenerf_mlp_small.config)])
+def test_the_papers_recipe_trains_by_its_losses_alone(config: TrainerConfig, data: Path) -> None:
+    history, pipeline = train(config, data, 3)
     assert pipeline.model.warp is None
     assert set(history[-1]) == {"reconstruction_loss", "temporal_loss", "interlevel_loss", "distortion_loss"}
     assert all(history[-1].values())
