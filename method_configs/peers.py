@@ -30,7 +30,6 @@ def peer(
     sampler: SamplerConfig,
     supervision: SupervisionConfig,
     loss_coefficients: LossCoefficients,
-    unbounded_init_density: float | None = None,
 ) -> tuple[MethodSpecification, MethodSpecification]:
     """Return another paper's method, at full size for a GPU and small for a CPU.
 
@@ -41,14 +40,14 @@ def peer(
         sampler: how batches are drawn.
         supervision: how renderings are compared with them.
         loss_coefficients: weights of the losses.
-        unbounded_init_density: in place of AE-NeRF's own density before training, in unbounded scenes.
     """
     config = deepcopy(aenerf.config)
     config.method_name = name
     config.pipeline.datamanager.sampler = sampler
     config.pipeline.model.supervision = supervision
     config.pipeline.model.loss_coefficients = loss_coefficients
-    config.pipeline.model.unbounded_init_density = unbounded_init_density
+    # The best for each of them in two scenes (docs/supervision.md).
+    config.pipeline.model.average_init_density = 1.0
     config.pipeline.model.camera_optimizer = PoseCorrectionConfig(mode="off")
     reduced = small(config)
     if isinstance(sampler, WindowSamplerConfig):
@@ -67,8 +66,6 @@ robust_enerf, robust_enerf_small = peer(
     PairSamplerConfig(max_events_per_pair=1, silent_pair_share=0.0),
     PairSupervisionConfig(allow_for_bandwidth=False),
     PairLossCoefficients(),
-    # Its own is 0.37. AE-NeRF's suits objects; in a room it costs 3 dB, and PAEv3D 2 dB (benchmarks/LOG.md).
-    unbounded_init_density=0.3,
 )
 """W. F. Low and G. H. Lee, ICCV 2023."""
 
@@ -86,7 +83,7 @@ evnerf, evnerf_small = peer(
     "evnerf",
     "Ev-NeRF's supervision",
     "slices of events, a dead zone and learned thresholds",
-    WindowSamplerConfig(shortest_window=0.02, longest_window=0.02, share_of_all_pixels=1.0),
+    WindowSamplerConfig(shortest_window=0.1, longest_window=0.1, share_of_all_pixels=1.0),
     SupervisionConfig(_target=EvNeRFSupervision),
     EvNeRFLossCoefficients(),
 )
@@ -96,10 +93,9 @@ paev3d, paev3d_small = peer(
     "paev3d",
     "PAEv3D's supervision",
     "patches in windows, with priors from optical flow",
-    WindowSamplerConfig(_target=FlowPatchSampler, longest_window=0.01),
+    WindowSamplerConfig(_target=FlowPatchSampler),
     SupervisionConfig(_target=PAEv3DSupervision),
     PAEv3DLossCoefficients(),
-    unbounded_init_density=0.3,
 )
 """J. Wang et al., ICRA 2024."""
 

@@ -76,8 +76,6 @@ class AENeRFModelConfig(ModelConfig):
     average_init_density: float = 10.0
     """Density of field and proposal networks before training, per scene unit. A scene that starts nearly transparent
     sits in a fog for hundreds of steps, until matter grows out of it."""
-    unbounded_init_density: float | None = None
-    """Density before training where space is contracted, in place of average_init_density where it is given."""
     loss_coefficients: LossCoefficients = dataclasses.field(default_factory=PairLossCoefficients)
     """Weights of the losses (paper, eq. 14)."""
     supervision: SupervisionConfig = dataclasses.field(default_factory=PairSupervisionConfig)
@@ -133,9 +131,6 @@ class AENeRFModel(Model):
         aabb = _with_room(self.scene_box.aabb) if learned else self.scene_box.aabb
         moves = learned and config.moving_field
         self.warp = PoseFollowingWarp(self.camera_optimizer, distortion, aabb) if moves else None
-        density = config.average_init_density
-        if distortion is not None and config.unbounded_init_density is not None:
-            density = config.unbounded_init_density
         self.field, proposal_networks = make_networks(
             config.backbone,
             config.field,
@@ -143,7 +138,7 @@ class AENeRFModel(Model):
             aabb,
             distortion,
             self.sensor.num_channels,
-            density,
+            config.average_init_density,
             self.warp,
         )
         self.proposal_networks = nn.ModuleList(proposal_networks)
@@ -405,11 +400,10 @@ def _require_possible(config: AENeRFModelConfig, duration: float) -> None:
     if offset is not None and not abs(offset) < duration:
         remedy = f"give seconds, fewer than the {duration:g} s of the trajectory"
         raise DataError("model", f"camera_optimizer.clock_offset {offset:g}", remedy)
-    for name in ("average_init_density", "unbounded_init_density"):
-        density = getattr(config, name)
-        # The start of the softplus overflows for larger ones.
-        if density is not None and not 0 < density < 700:
-            raise DataError("model", f"{name} {density:g}", "give a number above 0 and below 700")
+    density = config.average_init_density
+    # The start of the softplus overflows for larger ones.
+    if not 0 < density < 700:
+        raise DataError("model", f"average_init_density {density:g}", "give a number above 0 and below 700")
 
 
 def _with_room(aabb: Tensor) -> Tensor:

@@ -38,12 +38,6 @@ def test_outputs_have_their_shapes_and_ranges(backbone: str, bounded: bool, baye
     assert all(torch.isfinite(value).all() for value in outputs.values())
 
 
-def test_unbounded_scenes_may_start_from_another_density() -> None:
-    bounded, unbounded = (make_model(bounded=bounded, unbounded_init_density=0.3) for bounded in (True, False))
-    assert (bounded.field.average_init_density, unbounded.field.average_init_density) == (10.0, 0.3)
-    assert unbounded.proposal_networks[0].average_init_density == 0.3
-
-
 def test_between_events_changes_within_the_thresholds_are_right() -> None:
     model = make_model(loss_coefficients=PairLossCoefficients(interlevel_loss=0.0, distortion_loss=0.0))
     # Events tell of -0.3, 0.2, -0.3, 0.2, -0.3; the thresholds are 0.2 and 0.3.
@@ -254,7 +248,7 @@ def test_pictures_are_also_rendered_without_color_correction() -> None:
         ({"camera_optimizer": PoseCorrectionConfig(clock_offset=math.nan)}, "clock_offset nan; give seconds"),
         ({"average_init_density": 0.0}, "average_init_density 0; give a number above 0"),
         ({"color_correction_num_rays": 0}, "color_correction_num_rays 0; give thousands"),
-        ({"unbounded_init_density": 1000.0}, "unbounded_init_density 1000; .* below 700"),
+        ({"average_init_density": 1000.0}, "average_init_density 1000; .* below 700"),
     ],
 )
 def test_impossible_options_are_one_line(options: dict, message: str) -> None:

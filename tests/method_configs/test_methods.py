@@ -80,7 +80,7 @@ AS_ROBUST = (
     "--pipeline.datamanager.sampler.max-events-per-pair", "1",
     "--pipeline.datamanager.sampler.silent-pair-share", "0",
     "--pipeline.model.camera-optimizer.mode", "off",
-    "--pipeline.model.unbounded-init-density", "0.3",
+    "--pipeline.model.average-init-density", "1",
     "--pipeline.model.supervision.allow-for-bandwidth", "False",
 )  # fmt: skip
 

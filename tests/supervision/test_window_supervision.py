@@ -153,7 +153,7 @@ def test_sampling_is_seeded(random_poses: torch.Tensor) -> None:
     [
         ({"longest_window": 1.5}, "longest-window is 1.5; give a number from 0 to 1"),
         ({"share_of_all_pixels": -0.1}, "share-of-all-pixels is -0.1; give"),
-        ({"shortest_window": 0.2}, "shortest-window is 0.2, longest-window 0.05; give"),
+        ({"shortest_window": 0.2}, "shortest-window is 0.2, longest-window 0.1; give"),
         ({"pixels_per_window": 0}, "pixels-per-window is 0; give at least 1"),
     ],
 )

@@ -112,7 +112,7 @@ class WindowSamplerConfig(SamplerConfig):
     shortest_window: float = 0.0
     """Length of the shortest window, as a share of the intervals between the poses of the recording. It has at least
     one interval."""
-    longest_window: float = 0.05
+    longest_window: float = 0.1
     """Length of the longest window, as a share of the intervals between the poses of the recording. A window has at
     least one interval. Lengths are drawn uniformly from the shortest to the longest."""
     share_of_all_pixels: float = 0.1
