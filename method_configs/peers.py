@@ -46,7 +46,7 @@ def peer(
     config.pipeline.datamanager.sampler = sampler
     config.pipeline.model.supervision = supervision
     config.pipeline.model.loss_coefficients = loss_coefficients
-    # The best for each of them in two scenes (docs/supervision.md).
+    # Within 0.3 dB of the best for each of them (docs/supervision.md).
     config.pipeline.model.average_init_density = 1.0
     config.pipeline.model.camera_optimizer = PoseCorrectionConfig(mode="off")
     reduced = small(config)
