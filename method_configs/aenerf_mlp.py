@@ -66,14 +66,10 @@ def _make_small_config() -> AENeRFTrainerConfig:
     data = config.pipeline.datamanager
     data.train_num_rays_per_batch = data.eval_num_rays_per_batch = 512
     model = config.pipeline.model
-    model.field = FieldConfig(
-        num_samples_per_ray=24,
-        num_hidden_layers=4,
-        hidden_dim=128,
-        geometry_feature_dim=32,
-        xavier_initialization=True,
+    model.field = replace(
+        model.field, num_samples_per_ray=24, num_hidden_layers=4, hidden_dim=128, geometry_feature_dim=32
     )
-    model.proposal = ProposalConfig(num_samples_per_ray=(48,), num_hidden_layers=2, hidden_dim=32)
+    model.proposal = replace(model.proposal, num_samples_per_ray=(48,), num_hidden_layers=2, hidden_dim=32)
     for group in ("networks", "proposals"):
         # Narrow networks bear three times the rate.
         config.optimizers[group]["optimizer"].lr = 3e-3

@@ -197,10 +197,6 @@ class WarpedEvents:
             found += [comparison for comparison in between if comparison is not None]
         return sorted(found, key=lambda c: c.contrast - c.given, reverse=True)
 
-    def compare_without_motion(self) -> Comparison | None:
-        """Compare the contrast without any warping with the given contrast, unless the pixels have no directions."""
-        return self.compare(STILL)
-
     def shuffled_contrasts(self) -> NDArray[np.float64]:
         """Return the contrasts of the same events under the given poses, after their order was lost.
 

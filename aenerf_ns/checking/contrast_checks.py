@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from aenerf_ns.checking.contrast import WarpedEvents, contrast_of
+from aenerf_ns.checking.hypotheses import STILL
 from aenerf_ns.checking.result import CheckResult
 from aenerf_ns.recording.recording import Recording
 
@@ -34,7 +35,7 @@ def check_contrast(result: CheckResult, warped: WarpedEvents, is_simple: bool) -
     ``is_simple`` says that a simpler problem was found, which may be the reason of all that this finds.
     """
     figures, problems = result.figures, result.problems
-    still = warped.compare_without_motion()
+    still = warped.compare(STILL)
     if still is None:
         problems.append("the lens gives no direction to the pixels of nearly all events: check its distortion")
         return False

@@ -271,8 +271,8 @@ class EventSimulator:
             if self._bandwidth is not None:
                 light = ((last_intensity + intensity) / 2 + _DARK_RADIANCE) / (1 + _DARK_RADIANCE)
                 self._sum_of_light += light.mean() * (time_ns - self._time_ns)
-                # What a first-order filter holds after its input went linearly from the last logarithm to this one, in
-                # so many of its time constants.
+                # The input of a first-order filter goes linearly from the last logarithm to this one. That takes this
+                # many time constants of the filter.
                 time_constants = 2e-9 * math.pi * self._bandwidth * light * (time_ns - self._time_ns)
                 decay, rise = np.expm1(-time_constants), log_intensity - last_log
                 filtered = log_intensity + (last_filtered - last_log) * (1 + decay) + rise * decay / time_constants

@@ -429,7 +429,7 @@ def test_a_clock_is_named_where_four_slices_fit_it(in_favor: list[set[int]], pro
     ]  # fmt: skip
     warped = SimpleNamespace(
         spans=[(0, 10**8)] * 5,
-        compare_without_motion=lambda: SimpleNamespace(given=0.5, contrast=0.2, is_clearly_worse=True),
+        compare=lambda still: SimpleNamespace(given=0.5, contrast=0.2, is_clearly_worse=True),
         compare_alternatives=lambda: clocks,
         shuffled_contrasts=lambda: np.array([0.1, 0.1]),
     )
