@@ -52,8 +52,8 @@ _MAX_SHOWN_ERROR = 0.5
 # field a little, so the weights must stay for the rest of the run.
 _ACCUMULATION_SHARE, _UPDATE_INTERVAL = 0.3, 8
 
-# Room on each side of the scene box, as a share of its longest side, for a field that moves along with the poses. A
-# place that leaves the field's box has no density, so events at the border of a tight box would hold the poses back.
+# Room on each side of the scene box, as a share of its longest side, for poses that are corrected. A place that
+# leaves the field's box has no density, so events at the border of a tight box would hold the poses back.
 _ROOM = 0.05
 
 
@@ -68,7 +68,8 @@ class AENeRFModelConfig(ModelConfig):
     """Distance at which rays end in an unbounded scene, in scene units."""
     backbone: Backbone = "hash"
     """Kind of field and proposal networks. "hash": small networks on hash grids, with exponential density. "mlp": the
-    paper's large networks on integrated sinusoidal encodings, with softplus density."""
+    paper's kind of networks, with softplus density; their sinusoidal encodings are integrated, which the paper's are
+    not."""
     field: FieldConfig = dataclasses.field(default_factory=FieldConfig)
     """The event radiance field."""
     proposal: ProposalConfig = dataclasses.field(default_factory=ProposalConfig)
@@ -407,7 +408,7 @@ def _require_possible(config: AENeRFModelConfig, duration: float) -> None:
 
 
 def _with_room(aabb: Tensor) -> Tensor:
-    """Return a (2, 3) box that has room on each side for a scene that moves along with the corrections of the poses."""
+    """Return a (2, 3) box that has room on each side for a scene whose poses are corrected."""
     room = _ROOM * (aabb[1] - aabb[0]).max()
     return torch.stack([aabb[0] - room, aabb[1] + room])
 

@@ -23,8 +23,8 @@ _SIMULATE = {
     "tiny": ("--width", "96", "--height", "72", "--validation-views", "20", "--test-views", "20"),
 }
 # The errors that COLMAP leaves at full size: 0.5 degrees and 4 cm at easy speed, 1.1 degrees and 8 cm at hard speed
-# (medians over the sequences of the mean errors, benchmarks/results/estimated_poses_scenes_cpu2.json). They are larger
-# at tiny size, where a pixel covers a larger angle.
+# (medians over the sequences of the mean errors, benchmarks/results/estimated_poses_scenes_cpu2.json), from 25 frames a
+# second; from 125 they are smaller. They are larger at tiny size, where a pixel covers a larger angle.
 _FULL_SIZE_NOISE = ("--pose-noise-degrees", "0.7", "--pose-noise-translation", "0.03")
 _NOISE = {
     "full": _FULL_SIZE_NOISE,
