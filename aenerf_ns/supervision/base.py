@@ -221,6 +221,14 @@ class Sampler(ABC):
         self.device = device
         self.pixel_rays = PixelRays(dataset.scene, device)
 
+    def require_between(self, low: int, high: int, *options: str) -> None:
+        """Raise a DataError unless each of the named options is a number from ``low`` to ``high``."""
+        for option in options:
+            value = getattr(self.config, option)
+            if not low <= value <= high:
+                name = option.replace("_", "-")
+                raise DataError("the sampler", f"{name} is {value}", f"give a number from {low} to {high}")
+
     @abstractmethod
     def prepare(self) -> None:
         """Read the data now rather than with the first batch.

@@ -14,7 +14,6 @@ from nerfstudio.cameras.rays import RayBundle
 from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor, nn
 
-from aenerf_ns.errors import DataError
 from aenerf_ns.events.pair_store import MAX_SPAN, event_counts, is_pair, own_counts, pixel_index
 from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.recording.dataset import EventDataset
@@ -300,23 +299,11 @@ class PairSampler(Sampler):
     batch_type = PairBatch
 
     def __init__(
-        self,
-        config: PairSamplerConfig,
-        dataset: EventDataset,
-        supervision: PairSupervision,
-        device: torch.device | str,
+        self, config: PairSamplerConfig, dataset: EventDataset, supervision: PairSupervision, device: torch.device | str
     ) -> None:
         super().__init__(config, dataset, supervision, device)
-        if not 1 <= config.max_events_per_pair <= MAX_SPAN:
-            raise DataError(
-                "the sampler",
-                f"max-events-per-pair is {config.max_events_per_pair}",
-                f"give a number from 1 to {MAX_SPAN}",
-            )
-        if not 0 <= config.silent_pair_share <= 1:
-            raise DataError(
-                "the sampler", f"silent-pair-share is {config.silent_pair_share}", "give a number from 0 to 1"
-            )
+        self.require_between(1, MAX_SPAN, "max_events_per_pair")
+        self.require_between(0, 1, "silent_pair_share")
         consecutive = supervision.config.learn_refractory_period
         self._max_events_per_pair = 1 if consecutive else config.max_events_per_pair
         self._silent_pair_share = 0.0 if consecutive else config.silent_pair_share

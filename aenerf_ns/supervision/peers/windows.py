@@ -148,10 +148,7 @@ class WindowSampler(Sampler):
         self, config: WindowSamplerConfig, dataset: EventDataset, supervision: Supervision, device: torch.device | str
     ) -> None:
         super().__init__(config, dataset, supervision, device)
-        for name in ("shortest_window", "longest_window", "share_of_all_pixels"):
-            value = getattr(config, name)
-            if not 0 <= value <= 1:
-                raise DataError("the sampler", f"{name.replace('_', '-')} is {value}", "give a number from 0 to 1")
+        self.require_between(0, 1, "shortest_window", "longest_window", "share_of_all_pixels")
         if config.shortest_window > config.longest_window:
             raise DataError(
                 "the sampler",
