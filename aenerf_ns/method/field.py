@@ -120,7 +120,6 @@ class DensityField(Field):
             out_dim=1 + shape.feature_dim,
             skip_connections=(_SKIP_LAYER,) if shape.num_hidden_layers > _SKIP_LAYER else None,
             activation=SharpSoftplus(),
-            implementation="torch",
         )
 
     def get_density(self, ray_samples: RaySamples) -> tuple[Tensor, Tensor]:
@@ -166,7 +165,7 @@ class EventRadianceField(DensityField):
     ) -> None:
         super().__init__(aabb, spatial_distortion, encoding, shape, to_field_space)
         self.direction_encoding = NeRFEncoding(
-            in_dim=3, num_frequencies=4, min_freq_exp=0.0, max_freq_exp=3.0, include_input=True, implementation="torch"
+            in_dim=3, num_frequencies=4, min_freq_exp=0.0, max_freq_exp=3.0, include_input=True
         )
         self.radiance_network = MLP(
             in_dim=self.direction_encoding.get_out_dim() + shape.feature_dim,
@@ -174,7 +173,6 @@ class EventRadianceField(DensityField):
             layer_width=hidden_dim,
             out_dim=num_channels,
             activation=SharpSoftplus(),
-            implementation="torch",
         )
 
     def get_outputs(
@@ -201,26 +199,16 @@ class ProposalNetwork(HashMLPDensityField):
 
     Args:
         aabb: (2, 3) scene box.
-        num_levels: levels of the hash grid.
-        max_res: cells along an axis on the finest level.
-        log2_hashmap_size: binary logarithm of the entries of a level.
         grid_implementation: how the hash grid is computed, see :class:`.hash_grid.HashEncoding`.
         to_field_space: see :class:`DensityField`.
-        options: the other options of the framework's network.
+        options: of the framework's network, with ``num_levels``, ``max_res`` and ``log2_hashmap_size`` of its grid.
     """
 
     def __init__(
-        self,
-        aabb: Tensor,
-        num_levels: int,
-        max_res: int,
-        log2_hashmap_size: int,
-        grid_implementation: Implementation,
-        to_field_space: ToFieldSpace | None,
-        **options: Any,
+        self, aabb: Tensor, grid_implementation: Implementation, to_field_space: ToFieldSpace | None, **options: Any
     ) -> None:
-        grid = {"num_levels": num_levels, "max_res": max_res, "log2_hashmap_size": log2_hashmap_size}
-        super().__init__(aabb, implementation="torch", **grid, **options)
+        super().__init__(aabb, implementation="torch", **options)
+        grid = {name: options[name] for name in ("num_levels", "max_res", "log2_hashmap_size")}
         self.encoding = self.mlp_base[0] = HashEncoding(grid_implementation, **grid)
         self.to_field_space = to_field_space
 

@@ -369,14 +369,7 @@ class TwistNetwork(nn.Module):
         width = 256
         self.pose_embedding = nn.Linear(13, width)
         self.time_embedding = nn.Linear(1, width)
-        self.encoding = NeRFEncoding(
-            in_dim=width,
-            num_frequencies=3,
-            min_freq_exp=0.0,
-            max_freq_exp=2.0,
-            include_input=True,
-            implementation="torch",
-        )
+        self.encoding = NeRFEncoding(width, num_frequencies=3, min_freq_exp=0.0, max_freq_exp=2.0, include_input=True)
         layers: list[nn.Module] = []
         size = self.encoding.get_out_dim()
         for _ in range(4):
