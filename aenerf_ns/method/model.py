@@ -175,14 +175,10 @@ class AENeRFModel(Model):
                 groups["encodings" if name.endswith("hash_table") else networks].append(parameter)
         if self.raw_background is not None:
             groups["encodings"].append(self.raw_background)
-        if not groups["encodings"]:
-            # torch.optim refuses a group without parameters.
-            del groups["encodings"]
         self.camera_optimizer.get_param_groups(groups)
-        learned = list(self.supervision.parameters())
-        if learned:
-            groups["sensor"] = learned
-        return groups
+        groups["sensor"] = list(self.supervision.parameters())
+        # torch.optim refuses a group without parameters.
+        return {name: parameters for name, parameters in groups.items() if parameters}
 
     def get_training_callbacks(
         self, training_callback_attributes: TrainingCallbackAttributes
@@ -249,12 +245,10 @@ class AENeRFModel(Model):
         if is_trained_on and self.warp is not None and self.warp.accumulating:
             assert ray_bundle.times is not None
             self.warp.accumulate(samples.frustums.get_positions(), weights[..., 0], ray_bundle.times[:, 0])
-        weights_list.append(weights)
-        samples_list.append(samples)
         if self.training:
             outputs["log_radiance"] = log_radiance
-            outputs["weights_list"] = weights_list
-            outputs["ray_samples_list"] = samples_list
+            outputs["weights_list"] = [*weights_list, weights]
+            outputs["ray_samples_list"] = [*samples_list, samples]
         else:
             # The viewer shows the first at the start, and lists the others in this order.
             outputs["rgb"] = self.display(log_radiance.detach())

@@ -139,10 +139,7 @@ class PoseCorrection(CameraOptimizer):
 
     def clock_offset(self) -> Tensor:
         """Return δ, the float64 seconds by which the clock of the poses is ahead of the clock of the events."""
-        start = self.config.clock_offset
-        if start is None or self.clock_change is None:
-            return self._sampled_seconds.new_zeros(())
-        return start + _MAX_CLOCK_CHANGE * self.clock_change_share()
+        return (self.config.clock_offset or 0.0) + _MAX_CLOCK_CHANGE * self.clock_change_share()
 
     def clock_change_share(self) -> Tensor:
         """Return the learned change of the clock offset as a share of the largest one, between -1 and 1."""
@@ -216,6 +213,7 @@ class PoseCorrection(CameraOptimizer):
         origins, directions = world_rays(self.pose(raybundle.times[:, 0]), raybundle.metadata[CAMERA_DIRECTIONS])
         raybundle.origins, raybundle.directions = origins.to(raybundle.origins), directions.to(raybundle.directions)
 
+    @torch.no_grad()
     def apply_to_camera(self, camera: Cameras) -> Tensor:
         """Return the poses (N, 3, 4) of cameras in the frame of the corrected poses.
 
@@ -228,20 +226,18 @@ class PoseCorrection(CameraOptimizer):
         poses = camera.camera_to_worlds
         metadata = camera.metadata or {}
         if TRAJECTORY_SECONDS in metadata and self.is_learned:
-            with torch.no_grad():
-                return self.pose(metadata[TRAJECTORY_SECONDS][..., 0]).to(poses)
+            return self.pose(metadata[TRAJECTORY_SECONDS][..., 0]).to(poses)
         if REFERENCE_SECONDS not in metadata or (not self.is_learned and not self.has_ground_truth):
             return poses
-        with torch.no_grad():
-            carried = self.alignment().inverse()(poses.double())
-            if not self.has_ground_truth:
-                seconds = metadata[REFERENCE_SECONDS][..., 0]
-                on_trajectory = seconds.isfinite()
-                taken = seconds.nan_to_num(0.0)
-                motion = homogeneous(self.pose(taken)) @ torch.linalg.inv(homogeneous(self.trajectory.pose(taken)))
-                moved = (motion @ homogeneous(poses.double()))[:, :3]
-                carried = torch.where(on_trajectory[:, None, None], moved, carried)
-            return carried.to(poses)
+        carried = self.alignment().inverse()(poses.double())
+        if not self.has_ground_truth:
+            seconds = metadata[REFERENCE_SECONDS][..., 0]
+            on_trajectory = seconds.isfinite()
+            taken = seconds.nan_to_num(0.0)
+            motion = homogeneous(self.pose(taken)) @ torch.linalg.inv(homogeneous(self.trajectory.pose(taken)))
+            moved = (motion @ homogeneous(poses.double()))[:, :3]
+            carried = torch.where(on_trajectory[:, None, None], moved, carried)
+        return carried.to(poses)
 
     def world_twists(self, seconds: Tensor, base: Tensor) -> Tensor:
         """Return the float64 twists (N, 6) in the world that correct poses, in scene units and radians.
