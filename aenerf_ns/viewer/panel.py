@@ -13,7 +13,6 @@ import time
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import torch
 import viser.transforms
 from nerfstudio.utils import colormaps
 from nerfstudio.viewer.viewer_elements import ViewerCheckbox, ViewerControl, ViewerSlider
@@ -22,6 +21,7 @@ from torch import nn
 from viser import ClientHandle
 
 from aenerf_ns.errors import errors_as_one_line
+from aenerf_ns.evaluation.view_metrics import to_image
 from aenerf_ns.viewer.elements import DownloadButton, ViewerMarkdown
 from aenerf_ns.viewer.recording_view import RecordingView, png
 
@@ -173,7 +173,7 @@ class RecordingPanel(nn.Module):
             # A view from within it is hidden by its lines. The first view is.
             visible=not follows and seconds != self._first_time,
         )
-        points, colors = self.view.points(events) if in_scene else (np.zeros((0, 3)), np.zeros((0, 3), np.uint8))
+        points, colors = self.view.points(events if in_scene else events[:0])
         scene.add_point_cloud(
             "/recording/events",
             points * self._scale(),
@@ -274,8 +274,7 @@ class RecordingPanel(nn.Module):
         model.train(was_training)
         name = panel.output_render if panel.output_render in outputs else "rgb"
         shown = colormaps.apply_colormap(outputs[name], panel.colormap_options)
-        picture = (shown.clamp(0, 1) * 255).round().to(torch.uint8).cpu().numpy()
-        return f"snapshot_{name}_{self._viewer.step:06}.png", png(picture)
+        return f"snapshot_{name}_{self._viewer.step:06}.png", png(np.asarray(to_image(shown)))
 
     def _trajectory_file(self, _: ClientHandle) -> tuple[str, bytes]:
         assert self._viewer is not None
