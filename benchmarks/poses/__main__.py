@@ -18,6 +18,7 @@ import os
 import shlex
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
+from itertools import product
 from pathlib import Path
 from typing import Any, Literal
 
@@ -89,20 +90,15 @@ class Poses:
         os.environ["OMP_NUM_THREADS"] = "1"
         variants = {_DEFAULT: "", **self.variants}
         datasets = {name: self._dataset(name) for name in names}
-        settings = [
-            (name, case, variant, seed)
-            for seed in self.seeds
-            for name in names
-            for case in self.cases
-            for variant in variants
-        ]
+        settings = list(product(self.seeds, names, self.cases, variants))
         described = {
             name: {"about": SCENES[name].about, "simulate": shlex.join(datasets[name].command)} for name in names
         }
         about = {"method": self.method, "steps": self.steps, "variants": variants, "scenes": described}
         runner, runs, failed = Runner(self.work, "cpu"), [], []
 
-        def measure(name: str, case: str, variant: str, seed: int) -> dict[str, Any] | None:
+        def measure(seed: int, name: str, case: str, variant: str) -> dict[str, Any] | None:
+            setting = {"scene": name, "case": case, "variant": variant, "seed": seed}
             row, of_case, convert = _CASES[case]
             options = (*of_case, *shlex.split(variants[variant]))
             run = Run("poses", row, datasets[name], self.method, self.steps, seed, options, convert=convert)
@@ -110,7 +106,7 @@ class Poses:
                 made = runner.make(run)
             except DataError as error:
                 # Such as a recording whose poses are not found. The others go on.
-                failed.append({"scene": name, "case": case, "variant": variant, "seed": seed, "error": str(error)})
+                failed.append({**setting, "error": str(error)})
                 return None
             if made is None:
                 return None
@@ -118,8 +114,7 @@ class Poses:
             refined = placed.pop("refined_test_poses")
             # The views would be most of the file. They stay in the folder of the runs.
             placed.pop("views", None)
-            found = {"placed": placed, "refined": refined, "poses": self._pose_errors(run)}
-            return {"scene": name, "case": case, "variant": variant, "seed": seed, **found}
+            return {**setting, "placed": placed, "refined": refined, "poses": self._pose_errors(run)}
 
         with progress_bar() as progress, ThreadPoolExecutor(self.jobs) as pool:
             finished = pool.map(lambda chosen: measure(*chosen), settings)
@@ -218,20 +213,15 @@ def table(runs: list[dict[str, Any]]) -> list[dict[str, Any]]:
         own = {seed: run for (s, c, v, seed), run in of.items() if (s, c, v) == (scene, case, variant)}
         row: dict[str, Any] = {"scene": scene, "case": case, "variant": variant, "seeds": sorted(own)}
         for poses in ("placed", "refined"):
-            values = {seed: run[poses]["psnr"] for seed, run in own.items() if poses in run}
-            if not values:
-                continue
+            values = {seed: run[poses]["psnr"] for seed, run in own.items()}
             row[f"psnr_{poses}"] = _summary(list(values.values()))
-            for name, other in (
-                ("less_than_true_poses", (scene, "true poses", variant)),
-                ("more_than_default", (scene, case, _DEFAULT)),
+            for name, sign, other in (
+                ("less_than_true_poses", -1, (scene, "true poses", variant)),
+                ("more_than_default", 1, (scene, case, _DEFAULT)),
             ):
-                differences = [
-                    values[seed] - of[(*other, seed)][poses]["psnr"] for seed in values if (*other, seed) in of
-                ]
-                if differences and other != (scene, case, variant):
-                    sign = -1 if name == "less_than_true_poses" else 1
-                    row[f"psnr_{poses}_{name}"] = _summary([sign * value for value in differences])
+                others = {seed: of[(*other, seed)][poses]["psnr"] for seed in values if (*other, seed) in of}
+                if others and other != (scene, case, variant):
+                    row[f"psnr_{poses}_{name}"] = _summary([sign * (values[seed] - others[seed]) for seed in others])
         ends = [run["poses"] for run in own.values()]
         row["degrees"] = _summary([end["degrees"] for end in ends])
         row["translation"] = _summary([end["translation"] for end in ends])
