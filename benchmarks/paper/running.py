@@ -14,6 +14,7 @@ Several processes can work on the folder at once, or one after the other. Each s
 from __future__ import annotations
 
 import json
+import math
 import shlex
 import shutil
 import sys
@@ -83,6 +84,9 @@ class Runner:
         evaluation = self._folder / "runs" / run.name / "evaluation.json"
         made = json.loads(evaluation.read_text("utf8"))
         evaluation.unlink()
+        if math.isnan(made["results"]["psnr"]):
+            # aenerf-ns says so itself. Nerfstudio's own methods go on.
+            raise DataError(evaluation.parent, "the pictures are not numbers", "use another seed, or leave the run out")
         (config,) = (self._folder / "outputs" / run.name).rglob("config.yml")
         figures = {
             "table": run.table,

@@ -28,6 +28,7 @@ from aenerf_ns.method.image_metrics import ImageMetrics
 from aenerf_ns.method_configs.aenerf import aenerf_small
 from aenerf_ns.method_configs.aenerf_mlp import aenerf_mlp, aenerf_mlp_small
 from benchmarks.paper import tables
+from benchmarks.paper.__main__ import _make as make_all
 from benchmarks.paper.figures import draw, error_map
 from benchmarks.paper.plan import (
     CEILING,
@@ -42,6 +43,7 @@ from benchmarks.paper.plan import (
     Plan,
     Run,
 )
+from benchmarks.paper.running import Runner
 from benchmarks.paper.worker import prepare
 
 ROOT = Path(__file__).parents[2]
@@ -141,6 +143,24 @@ def test_published_runs_and_tables_are_made_again(folder: str, options: dict[str
         assert (run.row, run.method, run.true_poses) == (one["row"], one["method"], one["poses"] == "true")
     made, kept = tables.report(figures, {}).splitlines(), (published / "report.md").read_text().splitlines()
     assert {line for line in made if line.startswith("| ")} <= {*kept}
+
+
+def test_a_run_that_renders_no_numbers_failed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    # Nerfstudio trains on when the weights of nerfacto are lost.
+    run = next(run for run in small_plan() if run.row == CEILING)
+    (tmp_path / "transforms.json").write_text("{}")
+
+    def train(*_: Any) -> tuple[str, ...]:
+        for file in (tmp_path / "outputs" / run.name / "config.yml", tmp_path / "runs" / run.name / "evaluation.json"):
+            file.parent.mkdir()
+            file.write_text('{"results": {"psnr": NaN}, "train_seconds": 1.0}')
+        return ()
+
+    monkeypatch.setattr(Runner, "_dataset", lambda *_: tmp_path)
+    monkeypatch.setattr(Runner, "_train", train)
+    runner = Runner(tmp_path, "cpu")
+    assert "are not numbers" in make_all(runner, [run])[run.name]
+    assert runner.figures(run) is None
 
 
 def test_scene_file_has_the_name_of_its_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
