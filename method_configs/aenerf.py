@@ -29,10 +29,7 @@ from aenerf_ns.training.trainer import AENeRFTrainerConfig
 
 def optimized_by(scheduler: SchedulerConfig | None = None, **adam: Any) -> dict[str, Any]:
     """Return how a group of parameters is optimized: Adam's options, and by default a rate that falls at milestones."""
-    return {
-        "optimizer": FusedAdamOptimizerConfig(**adam),
-        "scheduler": scheduler or RelativeMultiStepSchedulerConfig(),
-    }
+    return {"optimizer": FusedAdamOptimizerConfig(**adam), "scheduler": scheduler or RelativeMultiStepSchedulerConfig()}
 
 
 aenerf = MethodSpecification(
@@ -60,9 +57,7 @@ aenerf = MethodSpecification(
         gradient_accumulation_steps={"camera_opt": 8},
         logging=LoggingConfig(
             local_writer=LocalWriterConfig(
-                _target=ConsoleWriter,
-                enable=True,
-                stats_to_track=(EventName.ITER_TRAIN_TIME, EventName.ETA),
+                _target=ConsoleWriter, enable=True, stats_to_track=(EventName.ITER_TRAIN_TIME, EventName.ETA)
             )
         ),
         viewer=ViewerConfig(websocket_host="127.0.0.1"),

@@ -11,12 +11,7 @@ from aenerf_ns.errors import DataError
 from aenerf_ns.evaluation.pose_refinement import NUM_STEPS
 from aenerf_ns.evaluation.poses import compare_with_ground_truth, describe_test_poses
 from aenerf_ns.evaluation.run import TrainedRun
-from aenerf_ns.evaluation.view_metrics import (
-    IMAGE_METRICS,
-    average_metrics,
-    describe_views,
-    measure_reference_views,
-)
+from aenerf_ns.evaluation.view_metrics import IMAGE_METRICS, average_metrics, describe_views, measure_reference_views
 from aenerf_ns.method.color_correction import AffineColorCorrection
 
 
@@ -75,10 +70,7 @@ def _describe_refined(run: TrainedRun, refined: Sequence[dict[str, float]], with
     if run.model.image_metrics.lpips_absent is not None:
         metrics["lpips"] = None
     start = describe_test_poses(run.model.camera_optimizer)
-    return {
-        **metrics,
-        "test_poses": f"photometric refinement, {NUM_STEPS} Levenberg-Marquardt steps, from: {start}",
-    }
+    return {**metrics, "test_poses": f"photometric refinement, {NUM_STEPS} Levenberg-Marquardt steps, from: {start}"}
 
 
 def _require_finite(metrics: dict[str, float], run: TrainedRun) -> None:

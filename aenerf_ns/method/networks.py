@@ -10,13 +10,7 @@ from nerfstudio.field_components.spatial_distortions import SpatialDistortion
 from nerfstudio.fields.base_field import Field
 from torch import Tensor, nn
 
-from aenerf_ns.method.field import (
-    DensityField,
-    DensityShape,
-    EventRadianceField,
-    IntegratedEncoding,
-    ProposalNetwork,
-)
+from aenerf_ns.method.field import DensityField, DensityShape, EventRadianceField, IntegratedEncoding, ProposalNetwork
 from aenerf_ns.method.hash_grid import HashEncoding, Implementation
 from aenerf_ns.method.pose_following_warp import PoseFollowingWarp
 

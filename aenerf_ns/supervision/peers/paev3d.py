@@ -38,11 +38,7 @@ from torch import Tensor
 from aenerf_ns.errors import DataError
 from aenerf_ns.recording.dataset import EventDataset
 from aenerf_ns.supervision.base import ChangeBatch, ChangeSupervision, LossCoefficients, Supervision
-from aenerf_ns.supervision.peers.windows import (
-    WindowSampler,
-    WindowSamplerConfig,
-    draw,
-)
+from aenerf_ns.supervision.peers.windows import WindowSampler, WindowSamplerConfig, draw
 
 # Changes are cut at that of this many events.
 _MAX_EVENTS = 5
