@@ -10,7 +10,7 @@ layout=$(mktemp -d)
 trap 'rm -rf "$layout"' EXIT
 mkdir "$layout/aenerf_ns"
 for entry in aenerf_ns/* dataparsers method_configs; do
-  ln -s "$PWD/$entry" "$layout/aenerf_ns/$(basename "$entry")"
+  ln -sfn "$PWD/$entry" "$layout/aenerf_ns/$(basename "$entry")"
 done
 ln -s "$PWD/benchmarks" "$layout/benchmarks"
 (cd "$layout" && mypy --config-file "$OLDPWD/pyproject.toml" --cache-dir "$OLDPWD/.mypy_cache" -p aenerf_ns -p benchmarks)
