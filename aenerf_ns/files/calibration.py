@@ -68,7 +68,7 @@ def read_calibration(
         DataError: the file is missing or malformed, it holds several cameras and one that is needed is not named, or it
             has no camera of a name.
     """
-    if path.suffix == ".json":
+    if path.suffix.lower() == ".json":
         require_no_names(path, event_camera, frame_camera)
         meta, lens = read_transforms(path, image_encoding="linear")
         with value_errors_as_data_error(path):

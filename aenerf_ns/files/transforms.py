@@ -18,6 +18,10 @@ from aenerf_ns.errors import DataError, value_errors_as_data_error
 from aenerf_ns.files.json_file import Nanoseconds, convert, read_json
 
 _MOUNT = "T_frame_event"
+# What other programs call the distortion and its model.
+_UNREAD_LENS = "dist(_|$)|.*distort|.*fisheye|lens_model"
+# Names of parts of a lens, also other programs'.
+_LENS = {"camera_model", "k1", "k2", "k3", "k4", "p1", "p2", "fl_x", "fx", "K", "camera_matrix", "intrinsics"}
 Vector = tuple[float, float, float]
 Row = tuple[float, float, float, float]
 Matrix = tuple[Row, Row, Row, Row]
@@ -118,16 +122,17 @@ def read_transforms(path: Path, image_encoding: ImageEncoding = "srgb") -> tuple
     values = {"image_encoding": image_encoding, **read_json(path, dict)}
     camera = values.get("event_camera")
     parts = [part for part in (values, camera) if isinstance(part, dict)]
-    for name in (name for part in parts for name in part if re.match("dist(_|$)|.*distort", name)):
-        remedy = "state camera_model, and k1, k2, p1, p2, k3 or for a fisheye k1 to k4"
+    for name in (name for part in parts for name, value in part.items() if value and re.match(_UNREAD_LENS, name)):
+        remedy = "state camera_model, and k1, k2, p1, p2, k3 or for a fisheye (OPENCV_FISHEYE) k1 to k4"
         raise DataError(path, f"it states {name}, which is not read", remedy)
     stated = [name for part in parts for name in part if re.match("T_.*event", name) and name != _MOUNT]
     if stated and not (isinstance(camera, dict) and camera.get(_MOUNT) is not None):
         remedy = f"state {_MOUNT} in event_camera, which takes points from its coordinates to the frame camera's"
         raise DataError(path, f"it states {stated[0]}, which is not read", remedy)
     if isinstance(camera, dict) and camera.keys().isdisjoint(("fl_x", "fl_y", "cx", "cy")):
-        if lens := sorted(camera.keys() & {"camera_model", "k1", "k2", "k3", "k4", "p1", "p2"}):
-            problem = f"event_camera: it states {lens[0]}, but no focal lengths and principal point"
+        # Without a size at the top, no other camera has the lens there.
+        if lens := sorted((camera if "w" in values else {**values, **camera}).keys() & _LENS):
+            problem = f"it states {lens[0]}, but event_camera has no fl_x, fl_y, cx and cy"
             raise DataError(path, problem, f"state these too, or leave {lens[0]} out: all is then estimated")
         size = convert(path, camera, _Size, name="event_camera")
         with value_errors_as_data_error(path):

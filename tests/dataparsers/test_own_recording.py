@@ -81,6 +81,7 @@ def test_own_recording_from_files_anywhere(truth: Truth, tmp_path: Path) -> None
         "events": "events.h5", "calibration": "calibration.json", "poses": "trajectory.txt", "images": "images.txt",
     }  # fmt: skip
     options = {option: (truth.data / name).rename(parts / f"mine_{name}") for option, name in names.items()}
+    options["calibration"] = options["calibration"].rename(parts / "MINE.JSON")
     recording = recording_of(OwnRecordingDataParserConfig(data=parts, **options))
     assert_same_poses(recording.trajectory.camera_to_worlds, truth.poses)
     assert len(recording.reference_views["train"]) == 3
@@ -108,9 +109,13 @@ def test_intrinsics_may_be_missing(truth: Truth) -> None:
     assert len(frames) == 3
     assert recording.image_encoding == "linear"
     # A part of a lens is a mistake.
-    file.write_text(json.dumps({**meta, "event_camera": {**meta["event_camera"], "camera_model": "OPENCV_FISHEYE"}}))
-    with pytest.raises(DataError, match="it states camera_model, but no focal lengths and principal point; state"):
-        parser.read_recording()
+    camera = meta["event_camera"]
+    for change in (
+        {"event_camera": {**camera, "camera_model": "OPENCV_FISHEYE"}}, {"event_camera": {**camera, "K": []}}, {"fl_x": 9},
+    ):  # fmt: skip
+        file.write_text(json.dumps({**meta, **change}))
+        with pytest.raises(DataError, match="it states .*, but event_camera has no fl_x, fl_y, cx and cy; state"):
+            parser.read_recording()
     meta["event_camera"]["fl_x"] = 50.0
     file.write_text(json.dumps(meta))
     with pytest.raises(DataError, match="missing required field `fl_y`"):
