@@ -88,7 +88,7 @@ class OwnRecordingDataParser(EventDataParser):
         config = self.config
         capture, frame_from_event, timed = self._read_all_but_poses()
         poses = self.poses_path()
-        if poses in (self._folder / "colmap", config.colmap):
+        if poses == config.colmap or poses.is_dir():
             if not timed:
                 remedy = "write a line for each: time[s] file"
                 raise DataError(self._image_list, "there is no such list of images", remedy)

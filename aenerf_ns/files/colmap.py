@@ -151,6 +151,9 @@ def _read_text(path: Path, file: BinaryIO) -> Iterator[Row]:
                 yield fields[9], values, int(camera)
             except (ValueError, IndexError, OverflowError):
                 raise _damaged(path, f"line {number} is not an image: {line[:40]!r}") from None
+        elif len(line.split()) % 3:
+            remedy = "write the features of an image, or an empty line, below its pose"
+            raise DataError(path, f"line {number} holds no features x y POINT3D_ID: {line[:40]!r}", remedy)
         is_pose = not is_pose
     raise _damaged(path, f"it has more than {_MAX_IMAGES:,} images")
 

@@ -195,6 +195,8 @@ def test_colmap_model_gives_poses_of_its_images(place: str, truth: Truth, capsys
     assert (recording.trajectory.times - EPOCH * 1_000).tolist() == [0, 5 * 10**8, 10**9]
     assert_same_poses(recording.trajectory.camera_to_worlds, truth.poses[[0, 5, 10]] @ shift, 1e-7)
     assert "COLMAP placed 3 of the 4 images" in capsys.readouterr().out
+    named = opened(truth, poses=truth.data / place).trajectory
+    assert torch.equal(named.camera_to_worlds, recording.trajectory.camera_to_worlds)
     # The images are where COLMAP put them.
     for view, pose in zip(recording.reference_views["train"], truth.poses[[0, 5, 10]], strict=True):
         np.testing.assert_allclose(view.camera_to_world.numpy(), pose, rtol=0, atol=1e-7)
@@ -235,6 +237,10 @@ def test_refuse_a_colmap_model_that_does_not_fit_the_images(placed: Truth) -> No
     text = model.read_text()
     model.write_text(text.replace("1 00002.png", "2 00002.png"))
     with pytest.raises(DataError, match="its images are of 2 cameras, and how these are mounted"):
+        opened(placed)
+    # Scripts drop the empty lines.
+    model.write_text(text.replace("\n\n", "\n"))
+    with pytest.raises(DataError, match="line 2 holds no features .*; write the features of an image, or an empty line"):
         opened(placed)
     model.write_text(text)
     listed.write_text("".join(f"7.5 {line.split()[1]}\n" for line in listed.read_text().splitlines()))
