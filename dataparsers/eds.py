@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from aenerf_ns.camera.intrinsics import CameraIntrinsics
+from aenerf_ns.dataparsers.own_recording import CALIBRATIONS
 from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.files.calibration import read_calibration
 from aenerf_ns.files.event_hdf5 import COLUMNS_AT_TOP, Hdf5TableFile
@@ -48,6 +49,11 @@ class EdsDataParserConfig(PublishedDataParserConfig):
     _target: type = field(default_factory=lambda: EdsDataParser)
     calibration: Path | None = None
     """Kalibr's camchain, in place of the authors' calibration. cam0 is the frame camera, cam1 the event camera."""
+
+    @classmethod
+    def recognizes(cls, data: Path) -> bool:
+        # Other programs give poses this name, too. Where a lens is stated, the authors' is another one.
+        return super().recognizes(data) and not any((data / name).exists() for name in CALIBRATIONS)
 
 
 class EdsDataParser(EventDataParser):

@@ -27,7 +27,8 @@ from aenerf_ns.recording.options import PublishedDataParserConfig
 from aenerf_ns.recording.recording import Capture, Recording
 from aenerf_ns.recording.views import IMAGE_LIST, read_image_list, require_distinct_times, views_on_trajectory
 
-_CALIBRATIONS = ("calibration.json", "camchain.yaml", "camera_info.yaml")
+CALIBRATIONS = ("calibration.json", "camchain.yaml", "camera_info.yaml")
+"""The files in a folder of which one is the calibration."""
 # COLMAP's own estimate may be off by some percent.
 _MAX_FOCAL_RATIO = 1.15
 
@@ -38,7 +39,7 @@ class OwnRecordingDataParserConfig(PublishedDataParserConfig):
 
     markers = (
         f"events{{{','.join(SUFFIXES)}}} (or such a file of any name in place of the folder)",
-        f"{' or '.join(_CALIBRATIONS)}, where there is one",
+        f"{' or '.join(CALIBRATIONS)}, where there is one",
         "poses in trajectory.txt or a COLMAP model in colmap, where there are any",
     )
     _target: type = field(default_factory=lambda: OwnRecordingDataParser)
@@ -73,7 +74,7 @@ class OwnRecordingDataParserConfig(PublishedDataParserConfig):
     def recognizes(cls, data: Path) -> bool:
         # Poses and calibration may be missing: they can be estimated. Events may, where a trained run is opened.
         has_poses = (data / "trajectory.txt").is_file() or (data / "colmap").is_dir()
-        has_calibration = any((data / name).is_file() for name in _CALIBRATIONS)
+        has_calibration = any((data / name).is_file() for name in CALIBRATIONS)
         has_events = any((data / f"events{suffix}").is_file() for suffix in SUFFIXES)
         return has_events or (has_calibration and has_poses) or (_is_event_file(data) and data.is_file())
 
@@ -146,11 +147,11 @@ class OwnRecordingDataParser(EventDataParser):
     def _read_calibration(self, has_images: bool) -> Calibration:
         config, file = self.config, self.config.calibration
         if file is None:
-            found = [self._folder / name for name in _CALIBRATIONS if (self._folder / name).is_file()]
+            found = [self._folder / name for name in CALIBRATIONS if (self._folder / name).is_file()]
             if not found:
                 require_no_names(self._folder, config.event_camera, config.frame_camera)
                 return _guess_calibration(self._event_file())
-            file = require_one(found, self._folder, f"of {' and '.join(_CALIBRATIONS)}", "give one as --calibration")
+            file = require_one(found, self._folder, f"of {' and '.join(CALIBRATIONS)}", "give one as --calibration")
         return read_calibration(file, config.event_camera, config.frame_camera, has_images)
 
     def _event_file(self, width: int | None = None, height: int | None = None) -> EventFile:

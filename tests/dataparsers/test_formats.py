@@ -142,6 +142,14 @@ def test_unknown_format_names_the_known_ones(tmp_path: Path) -> None:
         EventDataManagerConfig(dataparser=AutomaticDataParserConfig(data=tmp_path)).setup(device="cpu")
 
 
+def test_a_stated_lens_is_not_that_of_eds(tmp_path: Path) -> None:
+    for name in ("events.h5", "stamped_groundtruth.txt"):
+        (tmp_path / name).touch()
+    assert recognize(tmp_path) == "eds-data"
+    (tmp_path / "calibration.json").touch()
+    assert recognize(tmp_path) == "event-recording-data"
+
+
 def test_errors_say_that_the_format_was_guessed(tmp_path: Path) -> None:
     # Another recording's folders, of the names that PAEv3D has.
     (tmp_path / "H5_Files" / "mine").mkdir(parents=True)
