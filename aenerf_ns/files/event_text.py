@@ -77,7 +77,7 @@ def _is_row(line: bytes) -> bool:
 
 def _parse_names(line: bytes) -> tuple[list[str], TimeUnit | None] | None:
     """Return the names of the columns and the unit of the times that a line states, or None if it does not name all."""
-    text = line.decode("utf-8", "replace").lower().lstrip("#% ").replace(" [", "[")
+    text = line.decode("utf-8", "replace").lower().lstrip("#% ").replace(" [", "[").replace(" (", "(")
     names = [name.strip().strip('"') for name in (text.split(",") if "," in text else text.split())]
     # Seconds may have their nanoseconds in another column.
     times = [name for name in names if TIME_NAME.fullmatch(name) and "sec" not in name]

@@ -140,6 +140,7 @@ SPELLINGS = {
     "unit_in_comment.txt": "% t [ns] x y p\n" + "".join(f"{t}000 {x} {y} {p}\n" for x, y, t, p in PLAIN),
     "unit_in_comment.csv": "# t[ns],x,y,p\n" + "".join(f"{t}000,{x},{y},{p}\n" for x, y, t, p in PLAIN),
     "unit.csv": "timestamp [ms],x,y,polarity\n" + "".join(f"{t / 1e3},{x},{y},{p}\n" for x, y, t, p in PLAIN),
+    "unit_in_parentheses.csv": "t (ms),x,y,p\n" + "".join(f"{t / 1e3},{x},{y},{p}\n" for x, y, t, p in PLAIN),
     "unit_in_name.csv": "time_us,x,y,p\n" + "".join(f"{t}.0,{x},{y},{p}\n" for x, y, t, p in PLAIN),
     "two_times.csv": "timestamp_host,t,x,y,p\n" + "".join(f"{-t},{t},{x},{y},{p}\n" for x, y, t, p in PLAIN),
     "aliases.csv": "polarity,x,y,ts\n" + "".join(f"{p},{x},{y},{t}\n" for x, y, t, p in PLAIN),

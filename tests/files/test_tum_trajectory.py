@@ -41,6 +41,8 @@ POSES = {
     "w first behind secs": f"# secs, tx, ty, tz, qw, qx, qy, qz\n{W_FIRST}",
     "w first behind utime": f"#utime tx ty tz qw qx qy qz\n# eight words of a remark that names nothing\n{W_FIRST}",
     "names that state the unit": f"stamp_ms, tx, ty, tz, qx, qy, qz, qw\n492 {POSE}\n496 {POSE}\n",
+    "unit in parentheses": f"# time (ms) tx ty tz qx qy qz qw\n492 {POSE}\n496 {POSE}\n",
+    "unit in a remark": f"# timestamps (ms precision)\n0.492 {POSE}\n0.496 {POSE}\n",
     "w first": f"t,tx,ty,tz,qw,qx,qy,qz\n{W_FIRST}".replace(" ", ","),
 }
 
