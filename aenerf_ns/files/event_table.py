@@ -192,7 +192,8 @@ def events_from_columns(
     limit = MAX_TIME // tick - abs(offset)
     # NaN compares as false; no time is good where the offset alone is beyond the limit.
     good = (times >= -limit) & (times <= limit) if times.dtype.kind in "if" else (limit >= 0) & (times <= max(limit, 0))
-    require("t", good, "check the unit of the times (--event-time-unit) and the order of the columns")
+    unit = "the unit of the times (--event-time-unit of event-recording-data)"
+    require("t", good, f"check {unit} and the order of the columns")
 
     # Written with care for booleans and unsigned integers.
     positive, zero = polarities == 1, polarities == 0

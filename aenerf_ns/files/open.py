@@ -117,6 +117,6 @@ def _format(path: Path, beginning: bytes) -> str:
         raise DataError(
             path,
             f"its format is not known (it begins with {beginning[:8]!r})",
-            "RAW (EVT2, EVT3), DAT, AEDAT4, bags of ROS, HDF5, npz, npy, csv and text are read",
+            "RAW (EVT2, EVT3), DAT, AEDAT4, bags of ROS, HDF5, npz, npy, csv and text are read, unpacked",
         )
     return by_suffix

@@ -117,5 +117,5 @@ def test_columns_of_any_type_are_read_or_refused(data: st.DataObject) -> None:
 @pytest.mark.parametrize("kind", [np.uint8, np.uint64, np.int64, np.float64, bool])
 def test_refuse_offset_beyond_the_limit(kind: type) -> None:
     one = {name: np.zeros(1, kind if name == "t" else np.uint8) for name in "xytp"}
-    with pytest.raises(DataError, match="check the unit of the times"):
+    with pytest.raises(DataError, match=r"check the unit of the times \(--event-time-unit of event-recording-data\)"):
         events_from_columns(MADE, one, 10**9, str, 9_223_372_037)
