@@ -62,9 +62,6 @@ class Convert(DatasetCommand):
     """Keep only this part of the sensor, in pixels."""
     drop_hot_pixels: bool = False
     """Leave out pixels that fire by themselves. Reads the events twice."""
-    drop_malformed: bool = False
-    """Leave out events outside the sensor or out of order, as long as they are at most a thousandth, and say how many
-    and where."""
     shortest_interval_ns: int = 0
     """Leave out events that follow the last kept event of their pixel by less than this, in nanoseconds. Meant for
     pixels that fire repeatedly for one change of light. Leaving out any other event loses a change of light of one
@@ -97,7 +94,6 @@ class Convert(DatasetCommand):
                 seed=self.seed,
             )
         parser = self.open_dataset()
-        parser.config.drop_malformed |= self.drop_malformed
         with exclusive_output(self.output) as lock:
             self._convert(parser, filters, lock)
 

@@ -45,9 +45,17 @@ class DatasetCommand:
     """Format of the dataset. By default it is recognized from the names of the files."""
     format_options: Annotated[tuple[str, ...], tyro.conf.arg(metavar="KEY=VALUE ...")] = field(default=(), kw_only=True)
     """Options of the format (docs/options.md), such as width=346 height=260."""
+    drop_malformed: bool = field(default=False, kw_only=True)
+    """Leave out events outside the sensor or out of order, as long as they are at most a thousandth, and say how many
+    and where."""
 
     placing_options: ClassVar[tuple[str, ...]] = ()
     """Options of all formats that the command takes, too: they place the recording in a scene, or cut it."""
+
+    def __post_init__(self) -> None:
+        if self.drop_malformed:
+            # Where the command for training is printed, it is among the options.
+            self.format_options += ("drop-malformed=True",)
 
     def open_dataset(self) -> EventDataParser:
         """Make the parser of the dataset, which reads nothing yet.

@@ -195,6 +195,10 @@ def test_format_takes_options(name: str, options: tuple[str, ...], values: dict[
     assert parser.guessed_format == ("ecd-data" if name == "auto" else None)
 
 
+def test_every_command_drops_malformed_events(folder: Path) -> None:
+    assert DatasetCommand(folder / "F", drop_malformed=True).open_dataset().config.drop_malformed
+
+
 @pytest.mark.parametrize(
     ("option", "part"),
     [
