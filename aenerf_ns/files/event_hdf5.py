@@ -85,7 +85,7 @@ class Hdf5TableFile(EventTableFile):
         return arrays[self._layout.columns["t"][0]].parent.attrs
 
     def _stated_unit(self, arrays: Mapping[str, Any]) -> TimeUnit | None:
-        unit = _scalar(self._attributes(arrays).get("time_unit", super()._stated_unit(arrays)))
+        unit = _scalar(self._attributes(arrays).get("time_unit"))
         if unit is not None and not (isinstance(unit, str) and unit in NANOSECONDS):
             raise DataError(self.path, f"its time unit is {unit!r}", f"use one of {', '.join(NANOSECONDS)}")
         if unit and self._given_unit not in (None, unit):

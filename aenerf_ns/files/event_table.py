@@ -118,19 +118,22 @@ class EventTableFile(EventFile):
 
     def read_assumed_unit(self) -> TimeUnit | None:
         with self.open_arrays() as arrays:
-            return None if self._stated_unit(arrays) else self._given_unit or self._guessed_unit(arrays)
+            return None if self._stated_unit(arrays) else self._unit_of_format(arrays)
 
     def _stated_unit(self, arrays: Mapping[str, Any]) -> TimeUnit | None:
-        """Return the unit that the file states. Where it states none, return its layout's, unless a unit is given."""
-        return None if self._given_unit else self._layout.time_unit
+        """Return the unit that the file states, if it does."""
+        return None
 
-    def _guessed_unit(self, arrays: Mapping[str, Any]) -> TimeUnit:
+    def _unit_of_format(self, arrays: Mapping[str, Any]) -> TimeUnit:
+        """Return the unit that is given, or else the layout's, or the guessed one."""
+        if unit := self._given_unit or self._layout.time_unit:
+            return unit
         ends = ((0, SAMPLE), (max(self._length(arrays) - SAMPLE, 0), None))
         return guess_time_unit(np.concatenate([self._columns(arrays, *end)["t"] for end in ends]))
 
     def _tick(self, arrays: Mapping[str, Any]) -> int:
         """Return the nanoseconds of the unit of the times."""
-        return NANOSECONDS[self._stated_unit(arrays) or self._given_unit or self._guessed_unit(arrays)]
+        return NANOSECONDS[self._stated_unit(arrays) or self._unit_of_format(arrays)]
 
     def _read(self, arrays: Mapping[str, Any], first: int, last: int, tick: int) -> EventStream:
         columns, offset = self._columns(arrays, first, last), arrays.get("time_offset", 0)

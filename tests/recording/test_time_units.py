@@ -85,6 +85,14 @@ def test_message_names_the_unit_of_the_events(write: Callable, ticks: float, uni
     assert window_of(recording, event_time_unit=unit) == pytest.approx((0, 2), abs=1e-2)
 
 
+def test_message_names_the_unit_of_events_that_their_format_has_in_nanoseconds(recording: Path) -> None:
+    x, y, t, p = (scaled(random_events(), 1e6)[name] for name in "xytp")
+    np.savez(recording / "events.npz", position=np.stack([x, y], 1), timestamp=t, polarity=p)
+    with pytest.raises(DataError, match="give --event-time-unit us"):
+        window_of(recording)
+    assert window_of(recording, event_time_unit="us") == pytest.approx((0, 2))
+
+
 def test_message_names_the_unit_of_events_in_the_middle_of_the_poses(recording: Path) -> None:
     write_npz(recording, scaled(random_events(0.2, 1.2), 1e9))
     with pytest.raises(DataError, match="give --event-time-unit ns"):
