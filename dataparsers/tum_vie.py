@@ -25,8 +25,8 @@ from aenerf_ns.recording.recording import Capture, Recording
 from aenerf_ns.recording.views import read_image_times, views_on_trajectory
 
 _EVENT_FILE = re.compile(r"(?P<sequence>.+)-events_(?P<side>left|right)\.h5")
-# Sequences recorded with calibration A. All others were recorded with calibration B.
-_SET_A = {"loop-floor0", "loop-floor1", "loop-floor2", "loop-floor3", "mocap-desk", "mocap-desk2", "skate-easy"}
+# Sequences recorded with calibration A, and parts of them, begin so. All others were recorded with calibration B.
+_SET_A = ("loop-floor", "mocap-desk", "skate-easy")
 # Indices of the event camera and of the frame camera in the lists of the calibration.
 _INDICES = {"left": (2, 0), "right": (3, 1)}
 # Nanoseconds between poses of the motion capture that make a gap.
@@ -157,7 +157,7 @@ class TumVieDataParser(EventDataParser):
 
 
 def _calibration_set(sequence: str) -> Literal["A", "B"]:
-    return "A" if sequence in _SET_A else "B"
+    return "A" if sequence.startswith(_SET_A) else "B"
 
 
 def _event_files(data: Path) -> list[Path]:

@@ -167,7 +167,7 @@ def test_synthetic_scene_has_box_and_white_background(tmp_path: Path) -> None:
 
 
 def test_tum_vie_has_two_calibrations_and_two_sides(tmp_path: Path, tum_vie_calibration: Path) -> None:
-    for sequence, side in (("mocap-desk2", "right"), ("office-maze", "left"), ("office-maze", "right")):
+    for sequence, side in (("mocap-desk2-cut", "right"), ("office-maze", "left"), ("office-maze", "right")):
         folder = tmp_path / f"{sequence}-{side}"
         truth = write_tum_vie(folder, tum_vie_calibration, sequence, side)
         recording = recording_of(config_of("tum-vie-data", folder / f"{sequence}-events_{side}.h5"))

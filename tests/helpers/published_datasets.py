@@ -180,7 +180,7 @@ def write_tum_vie(
     else:
         shutil.copytree(calibration, folder, dirs_exist_ok=True)
     index = {"left": 2, "right": 3}[side]
-    which = "A" if sequence == "mocap-desk2" else "B"
+    which = "A" if "desk2" in sequence else "B"
     cameras = json.loads((folder / f"camera-calibration{which}.json").read_text())["value0"]
     mocap = json.loads((folder / f"mocap-imu-calibration{which}.json").read_text())["value0"]
 
