@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -27,9 +26,7 @@ class EsimEventFolder(EventFile):
     """A folder of .npy files with rows of x, y, t in nanoseconds and p: one stream, in the order of the names."""
 
     def _files(self) -> list[ArrayEventFile]:
-        # The order is that of the numbers in the names, which may lack leading zeros.
         paths = list_files(self.path, "*.npy")
-        paths.sort(key=lambda path: [int(number) for number in re.findall(r"\d+", path.name)])
         files = [ArrayEventFile(path, self.width, self.height, XYTP_MATRIX, "ns") for path in paths]
         for file in files:
             file.drop_malformed, file.left_out = self.drop_malformed, self.left_out

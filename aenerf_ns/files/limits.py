@@ -145,11 +145,15 @@ def require_unpacked_size(path: Path, name: str, unpacked: int, packed: int) -> 
 
 
 def visible_files(folder: Path, pattern: str) -> list[Path]:
-    """List the files and folders in a folder that match a pattern, in the order of their names.
+    """List the files and folders in a folder that match a pattern, in the order of their names: 2 is ahead of 10.
 
     Hidden ones do not count: macOS puts one beside each file that it copies to other disks.
     """
-    return sorted(file for file in folder.glob(pattern) if not file.name.startswith("."))
+
+    def order(file: Path) -> list[str | int]:
+        return [int(part) if part.isdecimal() else part for part in re.split(r"(\d+)", file.name)]
+
+    return sorted((file for file in folder.glob(pattern) if not file.name.startswith(".")), key=order)
 
 
 def list_files(folder: Path, pattern: str) -> list[Path]:

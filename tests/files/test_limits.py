@@ -68,3 +68,9 @@ def test_hidden_files_are_no_data(tmp_path: Path) -> None:
     for name in ("b.txt", "a.txt", "._a.txt"):
         (tmp_path / name).touch()
     assert [file.name for file in list_files(tmp_path, "*.txt")] == ["a.txt", "b.txt"]
+
+
+def test_files_are_in_the_order_of_their_numbers(tmp_path: Path) -> None:
+    for name in ("r_10.png", "r_9.png", "r_100.png"):
+        (tmp_path / name).touch()
+    assert [file.name for file in list_files(tmp_path, "*.png")] == ["r_9.png", "r_10.png", "r_100.png"]
