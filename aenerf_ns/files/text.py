@@ -20,7 +20,8 @@ NANOSECONDS: dict[TimeUnit, int] = {"ns": 1, "us": 1_000, "ms": 1_000_000, "s": 
 UNIT_NAMES = {"ns": "nanoseconds", "us": "microseconds", "ms": "milliseconds", "s": "seconds"}
 
 TIME_NAME = re.compile(
-    r"\W*(?:t|ts|time\w*?|stamp\w*?|secs?|seconds)(?:(?:\s*(?:\[|\((?=\w+\)))|_)(ns|us|ms|s)\b[])]?)?(?!\w)", re.IGNORECASE
+    r"\W*(?:t|ts|time\w*?|stamp\w*?|secs?|seconds)(?:(?:\s*(?:\[|\((?=\w+\)))|_)(ns|us|ms|s)\b[])]?)?(?!\w)",
+    re.IGNORECASE,
 )
 """The name of the column of times. It may state their unit, as timestamp [ns], t (us) and time_us do."""
 

@@ -62,7 +62,7 @@ _NATIVE_FAULTS: dict[str, Fault] = {
     "k4 without a fisheye": (top(k4=-0.1), "transforms.json", "k4 is -0.1, which camera_model OPENCV does not have"),
     "Kalibr's distortion": (camera(distortion_coeffs=[0.1]), "transforms.json", "distortion_coeffs, which is not read"),
     "model of distortion": (top(distortion_model="kb4"), "transforms.json", "distortion_model, which is not read"),
-    "Fisheye of instant-ngp": (top(is_fisheye=True), "transforms.json", "is_fisheye, which is not read; state camera_m"),
+    "Fisheye of instant-ngp": (top(is_fisheye=True), "transforms.json", "is_fisheye, which is not read; state camera"),
     "model by another name": (camera(lens_model="fisheye"), "transforms.json", "lens_model, which is not read"),
     "image of another size": (saved_as("PNG", "images/val/00000.png", (3, 2)), "val/00000.png", "3 x 2 pixels"),
     "BMP": (saved_as("BMP", "images/val/00000.png"), "val/00000.png", "save it as PNG or JPEG, or copy it again if"),
