@@ -61,12 +61,13 @@ def read_image_list(path: Path) -> list[tuple[int, Path]]:
         DataError: the list or an image is missing, or a line does not hold the two.
     """
     rows, _, stated = read_rows(path, "t file")
+    # Ahead of the files: the columns may be swapped.
+    times = parse_times(path, [row[0] for row in rows], stated or "s").tolist()
     files = [file_inside(path.parent, name, path) for _, name in rows]
     for file, (_, name) in zip(files, rows, strict=True):
         with reading(file):
             if not file.is_file():
                 raise DataError(path, f"it names {name}, which does not exist", "copy the images too")
-    times = parse_times(path, [row[0] for row in rows], stated or "s").tolist()
     return list(zip(times, files, strict=True))
 
 

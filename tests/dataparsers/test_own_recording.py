@@ -69,6 +69,9 @@ def test_own_recordings_have_views_at_their_times(truth: Truth) -> None:
         (truth.data / "images.txt").write_text(f"{names}\n{text}")
         views = opened(truth).reference_views["train"]
         assert [view.time for view in views] == times
+    (truth.data / "images.txt").write_text("".join(f"{name} {time}\n" for time, name in rows))
+    with pytest.raises(DataError, match=r"images/00000.png is not a time in seconds; write"):
+        opened(truth)
     view = recording.reference_views["test"][0]
     np.testing.assert_allclose(view.camera_to_world.numpy(), truth.poses[5], rtol=0, atol=1e-9)
 
