@@ -15,5 +15,5 @@ def require_range(option: str, value: float, low: float, high: float) -> None:
 
 
 def require_seed(seed: int) -> None:
-    """Raise a DataError for a seed that a random generator, COLMAP's among them, does not take."""
-    require_range("seed", seed, 0, 2**31 - 1)
+    """Raise a DataError for a seed that a random generator does not take."""
+    require_range("seed", seed, 0, 2**32 - 1)

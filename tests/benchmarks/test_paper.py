@@ -22,6 +22,7 @@ from nerfstudio.data.scene_box import SceneBox
 from nerfstudio.models.nerfacto import NerfactoModelConfig
 from PIL import Image
 
+from aenerf_ns.cli.ranges import require_seed
 from aenerf_ns.dataparsers.native import NativeDataParserConfig
 from aenerf_ns.errors import DataError
 from aenerf_ns.method.image_metrics import ImageMetrics
@@ -105,6 +106,17 @@ def test_losses_are_compared_on_equal_pairs() -> None:
         rays = {run.row: int(run.options[run.options.index(option) + 1]) for run in runs}
         assert rays["l_p + l_r"] == rays["l_p + l_r + l_d"] == own
         assert rays["l_p + l_r + l_g"] == rays["all"] == own // 2 * 3
+
+
+def test_seeds_of_the_datasets_are_accepted() -> None:
+    scenes = [f"scenes/{name}/scene.json" for name in ("games", "forklift", "living_room", "workshop")]
+    seeds = [
+        int(run.dataset.options[run.dataset.options.index("--seed") + 1])
+        for run in small_plan(scenes=scenes, seeds=(1,))
+    ]
+    assert max(seeds) >= 2**31
+    for seed in seeds:
+        require_seed(seed)
 
 
 def test_name_tells_runs_apart() -> None:
