@@ -63,10 +63,7 @@ def check_contrast(result: CheckResult, warped: WarpedEvents, is_simple: bool) -
         if c.is_clearly_better
         and c.contrast > noise
         and len(c.slices_in_favor)
-        >= max(
-            _MIN_CLOCK_SLICES if c.hypothesis.clock_offset else _MIN_SLICES,
-            _MIN_SHARE_IN_FAVOR * num_slices,
-        )
+        >= max(_MIN_CLOCK_SLICES if c.hypothesis.clock_offset else _MIN_SLICES, _MIN_SHARE_IN_FAVOR * num_slices)
     ]
     if better:
         best = better[0]

@@ -55,10 +55,7 @@ class Evaluate(RunCommand):
             "experiment_name": config.experiment_name,
             "method_name": config.method_name,
             "checkpoint": str(checkpoint),
-            "protocol": {
-                "color_correction": used,
-                "color_correction_of_run": of_run,
-            },
+            "protocol": {"color_correction": used, "color_correction_of_run": of_run},
             "results": results,
         }
         with creating(self.output) as file:

@@ -26,9 +26,7 @@ OUTSIDE_REMEDY = (
 def unsorted_error(source: str | Path, index: int, time: int, previous: int) -> DataError:
     """Return the error for an event that is before the one ahead of it, in nanoseconds."""
     return DataError(
-        source,
-        f"event {index} is at {time} ns, before the event ahead of it at {previous} ns",
-        UNSORTED_REMEDY,
+        source, f"event {index} is at {time} ns, before the event ahead of it at {previous} ns", UNSORTED_REMEDY
     )
 
 

@@ -318,23 +318,13 @@ class ColmapWorkspace:
         limits.create_max_angle_error = limits.continue_max_angle_error = max_degrees
         with self._step("Triangulating tracks"):
             posed = pycolmap.triangulate_points(
-                posed,
-                self._database,
-                self._images,
-                self._new_folder(),
-                clear_points=True,
-                options=options,
+                posed, self._database, self._images, self._new_folder(), clear_points=True, options=options
             )
             pycolmap.ObservationManager(posed).filter_observations_with_negative_depth()
         return posed
 
     def adjust(
-        self,
-        model: Any,
-        max_pixels: float,
-        max_degrees: float,
-        loss_scale: float,
-        refine_intrinsics: bool = False,
+        self, model: Any, max_pixels: float, max_degrees: float, loss_scale: float, refine_intrinsics: bool = False
     ) -> Any:
         """Triangulate all matches again from the poses of a model, and adjust poses and points to them.
 

@@ -43,12 +43,7 @@ MIN_IMAGES = 3
 
 @contextmanager
 def match_event_images(
-    capture: Capture,
-    window: TimeWindow,
-    source: str | Path,
-    seed: int,
-    weights: Path | None,
-    folder: Path | None,
+    capture: Capture, window: TimeWindow, source: str | Path, seed: int, weights: Path | None, folder: Path | None
 ) -> Iterator[tuple[ColmapWorkspace, NDArray[np.int64], list[NDArray[np.uint8]]]]:
     """Make images of the events (:func:`images_of_events`), and match their features.
 

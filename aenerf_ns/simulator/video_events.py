@@ -49,10 +49,7 @@ def video_simulator(video: Video, sensor: SensorModel, noise: SensorNoise = NOIS
 
 
 def video_events(
-    video: Video,
-    simulator: EventSimulator,
-    interpolation: Interpolation = "flow",
-    max_displacement: float = 0.5,
+    video: Video, simulator: EventSimulator, interpolation: Interpolation = "flow", max_displacement: float = 0.5
 ) -> Iterator[VideoInterval]:
     """Simulate an event sensor that sees a video. One frame after the other is read, so memory does not grow.
 

@@ -207,10 +207,7 @@ def test_crop_covers_the_interval(start: int, end: int, expected, random_poses: 
     ("change", "message"),
     [
         # So far from the start, float64 seconds do not resolve nanoseconds.
-        (
-            lambda times, poses: (times + np.r_[0, 10**18, 10**18], poses),
-            "pose 2 is at .*20 ns, not after .*10 ns",
-        ),
+        (lambda times, poses: (times + np.r_[0, 10**18, 10**18], poses), "pose 2 is at .*20 ns, not after .*10 ns"),
         (lambda times, poses: (times, poses[:2]), "3 times and 2 poses"),
         (lambda times, poses: (times, poses * torch.tensor([1.0, 1.0, 1.0, math.nan])), "pose 0 is not finite"),
         (lambda times, poses: (times, poses * 1.01), "is not a rigid motion"),

@@ -248,10 +248,7 @@ def test_broken_images_are_refused_before_poses_are_found(
 
 @pytest.mark.parametrize(
     ("factor", "shift", "message"),
-    [
-        (1000, 0, "as if the times of the images were in millisec"),
-        (1, 1000, "0 of 4 frames were taken during the ev"),
-    ],
+    [(1000, 0, "as if the times of the images were in millisec"), (1, 1000, "0 of 4 frames were taken during the ev")],
 )
 def test_frames_on_another_clock_are_refused_before_poses_are_found(
     factor: int, shift: int, message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

@@ -79,8 +79,7 @@ HOSTILE = {
 
 
 @pytest.mark.parametrize(
-    ("command", "text"),
-    [*((command, TOUCH) for command in COMMANDS), *((Evaluate, text) for text in HOSTILE.values())],
+    ("command", "text"), [*((command, TOUCH) for command in COMMANDS), *((Evaluate, text) for text in HOSTILE.values())]
 )
 def test_foreign_names_are_refused(
     command: Callable[..., Evaluate], text: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

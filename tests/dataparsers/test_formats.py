@@ -12,15 +12,7 @@ import torch
 import yaml
 from helpers.dataset_faults import remove
 from helpers.event_file_checks import read
-from helpers.published_datasets import (
-    WRITERS,
-    Truth,
-    assert_same_poses,
-    config_of,
-    recording_of,
-    seconds,
-    write_poses,
-)
+from helpers.published_datasets import WRITERS, Truth, assert_same_poses, config_of, recording_of, seconds, write_poses
 from helpers.small_datasets import AS_RECORDED, parse
 
 from aenerf_ns.cli.convert import Convert

@@ -11,17 +11,7 @@ import numpy as np
 import pytest
 from helpers.bag_writers import ARRAY, PACKET, START, array_bag, array_message, packet_message, write_bag
 from helpers.event_file_checks import assert_one_line, attempt
-from helpers.event_file_writers import (
-    HEADER2,
-    HEADER3,
-    ROWS,
-    aedat4_file,
-    dat,
-    evt2,
-    evt3_of,
-    evt3_words,
-    words,
-)
+from helpers.event_file_writers import HEADER2, HEADER3, ROWS, aedat4_file, dat, evt2, evt3_of, evt3_words, words
 from helpers.event_table_writers import HEIGHT, WIDTH, ZEROS, N, T, made_columns, records, replaced
 
 from aenerf_ns.errors import DataError

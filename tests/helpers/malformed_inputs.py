@@ -283,9 +283,7 @@ _CHANGES: dict[str, dict[str, Change]] = {
         "no dimensions": robust_events(timestamp=np.int64(3)),
         "robust image": outside_image(view("../../outside"), (50, 30), "RGBA"),
     },
-    _OWN: {
-        "own t_offset that is a group": edit_hdf5(_H5, lambda f: without(f, "t_offset").create_group("t_offset")),
-    },
+    _OWN: {"own t_offset that is a group": edit_hdf5(_H5, lambda f: without(f, "t_offset").create_group("t_offset"))},
     _ESIM: {"width of 64.5": lambda folder: np.save(folder / "poses_bounds.npy", np.full((3, 17), 64.5))},
     _EDS: {
         "HDF5 columns of 10^12 rows": unallocated("events.h5", {**_COLUMNS, "p": "u1"}),

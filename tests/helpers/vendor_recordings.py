@@ -18,17 +18,7 @@ from scipy.spatial.transform import Rotation
 from aenerf_ns.dataparsers.own_recording import OwnRecordingDataParserConfig
 from helpers.bag_writers import ARRAY, PACKET, array_message, packet_messages, write_bag, write_bag2
 from helpers.dataset_faults import Change, all_of, edit_bytes, read_everything, sparse
-from helpers.event_file_writers import (
-    HEIGHT,
-    WIDTH,
-    Rows,
-    aedat4_file,
-    aedat4_packet,
-    dat,
-    evt2,
-    evt3,
-    flat_table,
-)
+from helpers.event_file_writers import HEIGHT, WIDTH, Rows, aedat4_file, aedat4_packet, dat, evt2, evt3, flat_table
 from helpers.malformed_inputs import FORMAT_WRITERS, camchain
 from helpers.own_recordings import write_calibration, write_poses
 from helpers.published_datasets import CAMCHAIN, config_of, write_own
@@ -266,13 +256,8 @@ _BOMBS: dict[str, dict[str, Change]] = {
         "zeros without end": sparse("*.raw"),
         "only zeros": sparse("*.raw", b"% evt 2.0\n% geometry 64x48\n% end\n"),
     },
-    "evt3": {
-        "only zeros": sparse("*.raw", b"% evt 3.0\n% geometry 64x48\n% end\n"),
-    },
-    "dat": {
-        "zeros without end": sparse("*.dat"),
-        "only zeros": sparse("*.dat", dat([])),
-    },
+    "evt3": {"only zeros": sparse("*.raw", b"% evt 3.0\n% geometry 64x48\n% end\n")},
+    "dat": {"zeros without end": sparse("*.dat"), "only zeros": sparse("*.dat", dat([]))},
     "aedat4": {
         "zeros in place of packets": sparse(_AEDAT4, aedat4_file([])[:-100]),
         "a packet of 2 GB": all_of(

@@ -20,13 +20,7 @@ from aenerf_ns.camera.trajectory import Trajectory, homogeneous
 from aenerf_ns.errors import DataError
 from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.recording.writer import NativeDatasetWriter
-from aenerf_ns.report.comparison import (
-    Protocol,
-    paired_differences,
-    protocol_differences,
-    shared_views,
-    views_left_out,
-)
+from aenerf_ns.report.comparison import Protocol, paired_differences, protocol_differences, shared_views, views_left_out
 from aenerf_ns.report.measuring import RunReport
 from aenerf_ns.report.pair_residuals import average_by_length, average_by_tile
 from aenerf_ns.report.poses import RunPoses, correction_components, measure_poses

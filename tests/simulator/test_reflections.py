@@ -37,11 +37,7 @@ def test_without_specular_is_diffuse() -> None:
     other = mesh_of(trimesh.creation.icosphere(2, 0.2).apply_translation((0, 0, 0.5)))
     diffuse, rough, beside_gloss = (
         light_mesh(joined(mesh, ball), sky(BLACK, (1, 1, 1)), [lamp], BLACK)
-        for mesh, ball in (
-            (mesh, other),
-            (coated(mesh, 0.0, 0.3), other),
-            (mesh, coated(other, 0.3, 0.1)),
-        )
+        for mesh, ball in ((mesh, other), (coated(mesh, 0.0, 0.3), other), (mesh, coated(other, 0.3, 0.1)))
     )
     assert diffuse.reflections is None
     pictures = [scene.render(OVERHEAD, LENS, *SIZE, 4) for scene in (diffuse, rough, beside_gloss)]

@@ -59,12 +59,7 @@ def test_a_pair_spans_several_events(random_poses: torch.Tensor) -> None:
     # All that end with an event of their pixel, never beyond its first.
     found = Counter(map(tuple, rows.tolist()))
     one, two = (250_000_000, 10**9, 1, 0, 0, 0.75), (5_000, 10**9, 1, 1, 0, 0.75)
-    assert found.keys() == {
-        (100_000, 600_000_000, 0, 1, 1, 0.5999),
-        (5_000, 250_000_000, 0, 1, 1, 0.249995),
-        one,
-        two,
-    }
+    assert found.keys() == {(100_000, 600_000_000, 0, 1, 1, 0.5999), (5_000, 250_000_000, 0, 1, 1, 0.249995), one, two}
     # One event in half of the cases: log 2 / log 4.
     assert found[one] / found[two] == pytest.approx(1, abs=0.2)
 

@@ -20,11 +20,7 @@ from aenerf_ns.errors import DataError
 from aenerf_ns.events.sensor import BayerPattern, SensorModel
 from aenerf_ns.recording.scene import SCENE_KEY
 from aenerf_ns.supervision.base import SamplerConfig
-from aenerf_ns.supervision.peers.frames import (
-    FrameBatch,
-    FrameSampler,
-    FrameSupervision,
-)
+from aenerf_ns.supervision.peers.frames import FrameBatch, FrameSampler, FrameSupervision
 
 SECONDS = (0.0, 0.25, 0.7)
 

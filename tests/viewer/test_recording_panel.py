@@ -14,15 +14,7 @@ import pytest
 import torch
 from helpers.browser import eventually
 from helpers.small_pipelines import make_pipeline, make_pipeline_config
-from helpers.small_viewers import (
-    DURATION,
-    SIZE,
-    Browser,
-    browser_of,
-    make_recording,
-    sent,
-    viewer_of,
-)
+from helpers.small_viewers import DURATION, SIZE, Browser, browser_of, make_recording, sent, viewer_of
 from nerfstudio.viewer.viewer import Viewer
 from PIL import Image
 
