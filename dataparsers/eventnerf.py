@@ -168,9 +168,8 @@ def read_matrix(path: Path, *num_rows: int) -> np.ndarray:
     """
     fields = read_text(path, _MAX_BYTES).split()
     if len(fields) not in [4 * rows for rows in num_rows]:
-        raise DataError(
-            path, f"it holds {len(fields)} numbers", f"it must hold {' or '.join(f'{rows} x 4' for rows in num_rows)}"
-        )
+        problem = f"it holds {len(fields)} numbers"
+        raise DataError(path, problem, f"it must hold {' or '.join(f'{rows} x 4' for rows in num_rows)}")
     matrix = parse_numbers(path, [fields]).reshape(-1, 4)
     if not np.isfinite(matrix).all():
         raise DataError(path, "a number is not finite", "drop it, and its image")

@@ -132,8 +132,7 @@ def _read_views(path: Path, meta: Transforms, recording: Recording) -> dict[Spli
         names = getattr(meta, f"{split}_filenames")
         unknown = [name for name in names if name not in views]
         if unknown:
-            raise DataError(
-                path, f"{split}_filenames names {unknown[0]}, which is not among the frames", "add it there"
-            )
+            problem = f"{split}_filenames names {unknown[0]}, which is not among the frames"
+            raise DataError(path, problem, "add it there")
         splits[split] = [view for name in names if (view := views[name]) is not None]
     return splits

@@ -138,11 +138,8 @@ def _read_poses(path: Path) -> Trajectory:
         arrays.items(), ((length, 3), (length, 4), (length,)), ("iuf", "iuf", "iu"), strict=True
     ):
         if array.shape != shape or array.dtype.kind not in kinds:
-            raise DataError(
-                path,
-                f"T_wc_{name} has type {array.dtype} and shape {array.shape}",
-                f"it must hold {' x '.join(map(str, shape))} numbers, for {length} integer times in nanoseconds",
-            )
+            remedy = f"it must hold {' x '.join(map(str, shape))} numbers, for {length} integer times in nanoseconds"
+            raise DataError(path, f"T_wc_{name} has type {array.dtype} and shape {array.shape}", remedy)
     positions, quaternions, times = arrays.values()
     poses = poses_from_quaternions(path, positions.astype(np.float64), quaternions.astype(np.float64))
     return Trajectory(times.astype(np.int64), poses, path)

@@ -77,9 +77,8 @@ class Convert(DatasetCommand):
         require_seed(self.seed)
         if self.weights is not None:
             if self.poses not in ("refined", "events"):
-                raise DataError(
-                    "--weights", f"--poses {self.poses} makes no images of events", "choose --poses refined or events"
-                )
+                problem = f"--poses {self.poses} makes no images of events"
+                raise DataError("--weights", problem, "choose --poses refined or events")
             require_weights(self.weights)
         from aenerf_ns.events.filters import EventFilters
 
@@ -113,11 +112,9 @@ class Convert(DatasetCommand):
         events = EventSelection(source.path, source.width, source.height, filters, capture.sensor.bayer_pattern)
         # Refused before poses are found, which may take hours.
         if self.region is not None and capture.sensor.bayer_pattern and (self.region[0] % 2 or self.region[1] % 2):
-            raise DataError(
-                "aenerf convert",
-                f"a region of interest from pixel {self.region[0]} {self.region[1]} of a color sensor",
-                "begin it at an even column and row, so that the Bayer pattern begins there as on the whole sensor",
-            )
+            problem = f"a region of interest from pixel {self.region[0]} {self.region[1]} of a color sensor"
+            remedy = "begin it at an even column and row, so that the Bayer pattern begins there as on the whole sensor"
+            raise DataError("aenerf convert", problem, remedy)
         copied = images if self.poses == "events" and capture.frame_camera == capture.event_camera else []
         if self.poses == "refined":
             _, copied = parser.read_frames()
@@ -187,11 +184,8 @@ class Convert(DatasetCommand):
         if num_inside <= len(times) // 10:
             require_seconds(times, self.data, "events", span)
         if len(times) > 2 and num_inside < 2:
-            raise DataError(
-                self.data,
-                f"{num_inside} of {len(times)} frames were taken during the events, from {first} to {last} ns",
-                "give the times of the frames in seconds on the clock of the events",
-            )
+            problem = f"{num_inside} of {len(times)} frames were taken during the events, from {first} to {last} ns"
+            raise DataError(self.data, problem, "give the times of the frames in seconds on the clock of the events")
         lens = capture.event_camera
         camera = (lens.width, lens.height) if capture.intrinsics_origin == "guessed" else lens
         return _with_poses(
@@ -241,11 +235,8 @@ def _cut(recording: Recording, window: TimeWindow) -> Trajectory:
     first, last = recording.event_file.time_span()
     start, end = max(first, window.start), min(last, window.end)
     if end < start:
-        raise DataError(
-            recording.event_file.path,
-            f"its events are from {first} to {last} ns, all outside the time window",
-            "widen the time window (--start-time-ns, --end-time-ns)",
-        )
+        problem = f"its events are from {first} to {last} ns, all outside the time window"
+        raise DataError(recording.event_file.path, problem, "widen the time window (--start-time-ns, --end-time-ns)")
     covered = recording.trajectory.crop(start, end)
     return recording.trajectory if window == TimeWindow() else covered
 

@@ -112,11 +112,8 @@ class Reconstruct(DatasetCommand):
                 writer.add_image("train", image, homogeneous(reference.interpolate(time)), time)
                 yield image
         if num_posed == 0:
-            raise DataError(
-                events.path,
-                f"its events make {num_images} images of {num_events} events each, none at a time with a pose",
-                "give a smaller --events-per-pixel, or poses that cover the events",
-            )
+            problem = f"its events make {num_images} images of {num_events} events each, none at a time with a pose"
+            raise DataError(events.path, problem, "give a smaller --events-per-pixel, or poses that cover the events")
         if num_posed < num_images:
             left_out = num_images - num_posed
             say(f"{left_out} of {num_images} images are left out: no pose, or no true pose, is known at their times.")

@@ -58,20 +58,14 @@ class ReportCommand:
             del opened_run
             gc.collect()
         if self.data is not None and len({config.__dict__["data_at_training"] for config, _ in opened}) > 1:
-            raise DataError(
-                "aenerf report",
-                "--data names one dataset, but the runs were trained on several",
-                "leave it out, and link the datasets to where they were",
-            )
+            problem = "--data names one dataset, but the runs were trained on several"
+            raise DataError("aenerf report", problem, "leave it out, and link the datasets to where they were")
         names = _names([config for config, _ in opened])
         protocols = [protocol for _, protocol in opened]
         mixed = comparison.protocol_differences(names, protocols)
         if mixed and not self.allow_different_protocols:
-            raise DataError(
-                "aenerf report",
-                f"the runs are measured differently: {'; '.join(mixed)}",
-                "evaluate both alike, or give --allow-different-protocols",
-            )
+            problem = f"the runs are measured differently: {'; '.join(mixed)}"
+            raise DataError("aenerf report", problem, "evaluate both alike, or give --allow-different-protocols")
         shared = comparison.shared_views(protocols)
         reports: list[RunReport] = []
         for run, name in zip(self.runs, names, strict=True):

@@ -88,11 +88,8 @@ class SimulateVideo(SimulationCommand):
             if self.poses == "colmap":
                 raise DataError(_COMMAND, "--trajectory with --poses colmap", "leave out one of them")
             if self.calibration is None and self.intrinsics is None:
-                raise DataError(
-                    _COMMAND,
-                    "--trajectory without the intrinsics of the camera",
-                    "give --calibration or --intrinsics, or let COLMAP estimate lens and poses with --poses colmap",
-                )
+                remedy = "give --calibration or --intrinsics, or let COLMAP estimate lens and poses with --poses colmap"
+                raise DataError(_COMMAND, "--trajectory without the intrinsics of the camera", remedy)
 
     def _simulate(self, sensor: SensorModel, noise: SensorNoise, lock: OutputLock) -> None:
         import numpy as np

@@ -68,9 +68,8 @@ def open_run(
         raise DataError(config, f"the run is of method {opened.method_name}", "use ns-eval and ns-export")
     for name, value in pipeline.named_parameters():
         if not value.isfinite().all():
-            raise DataError(
-                checkpoint, f"its {name} is not finite", "move it away if there is an earlier one, or train again"
-            )
+            problem = f"its {name} is not finite"
+            raise DataError(checkpoint, problem, "move it away if there is an earlier one, or train again")
     # A run that was stopped, or that goes on, has made other steps than it planned.
     opened.max_num_iterations = step_of(checkpoint) + 1
     return opened, pipeline.trained_run(), checkpoint

@@ -112,8 +112,5 @@ def require_event_sensor_size(
 ) -> None:
     """Raise a DataError for a number of pixels that no event sensor has, before anything of that size is allocated."""
     if width * height > _MAX_PIXELS:
-        raise DataError(
-            source,
-            f"an event sensor of {width} x {height} pixels is too large",
-            f"{remedy}, at most {_MAX_PIXELS:,} pixels",
-        )
+        problem = f"an event sensor of {width} x {height} pixels is too large"
+        raise DataError(source, problem, f"{remedy}, at most {_MAX_PIXELS:,} pixels")

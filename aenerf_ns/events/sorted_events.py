@@ -100,11 +100,8 @@ def sort_events(chunks: Iterable[EventStream], *, window: TimeWindow, usable: ND
     for chunk in chunks:
         source = chunk.source
         if (chunk.height, chunk.width) != usable.shape:
-            raise DataError(
-                source,
-                f"its sensor has {chunk.width} x {chunk.height} pixels, its lens model {width} x {height}",
-                "state one size",
-            )
+            problem = f"its sensor has {chunk.width} x {chunk.height} pixels, its lens model {width} x {height}"
+            raise DataError(source, problem, "state one size")
         total += len(chunk)
         kept = window.contains(chunk.t)
         inside += int(kept.sum())

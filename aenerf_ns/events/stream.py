@@ -25,9 +25,8 @@ OUTSIDE_REMEDY = (
 
 def unsorted_error(source: str | Path, index: int, time: int, previous: int) -> DataError:
     """Return the error for an event that is before the one ahead of it, in nanoseconds."""
-    return DataError(
-        source, f"event {index} is at {time} ns, before the event ahead of it at {previous} ns", UNSORTED_REMEDY
-    )
+    problem = f"event {index} is at {time} ns, before the event ahead of it at {previous} ns"
+    return DataError(source, problem, UNSORTED_REMEDY)
 
 
 _COLUMNS = {"x": np.uint16, "y": np.uint16, "t": np.int64, "p": np.int8}
@@ -63,38 +62,26 @@ class EventStream:
         for name, dtype in _COLUMNS.items():
             column = getattr(self, name)
             if column.dtype != dtype or column.ndim != 1:
-                raise DataError(
-                    self.source,
-                    f"column {name} has type {column.dtype} and shape {column.shape}",
-                    f"store it as one row of {np.dtype(dtype).name}",
-                )
+                problem = f"column {name} has type {column.dtype} and shape {column.shape}"
+                raise DataError(self.source, problem, f"store it as one row of {np.dtype(dtype).name}")
             if len(column) != len(self.t):
-                raise DataError(
-                    self.source,
-                    f"column {name} has {len(column)} entries but column t has {len(self.t)}",
-                    "store all four columns with the same length",
-                )
+                problem = f"column {name} has {len(column)} entries but column t has {len(self.t)}"
+                raise DataError(self.source, problem, "store all four columns with the same length")
         if len(self.t) == 0:
             return
         for name, limit, size in (("x", self.width, "width"), ("y", self.height, "height")):
             column = getattr(self, name)
             if column.max() >= limit:
                 index = int(np.argmax(column >= limit))
-                raise DataError(
-                    self.source,
-                    f"event {index} has {name} = {column[index]} on a sensor of {size} {limit}",
-                    OUTSIDE_REMEDY,
-                )
+                problem = f"event {index} has {name} = {column[index]} on a sensor of {size} {limit}"
+                raise DataError(self.source, problem, OUTSIDE_REMEDY)
         if (self.t[1:] < self.t[:-1]).any():
             index = int(np.argmax(self.t[1:] < self.t[:-1])) + 1
             raise unsorted_error(self.source, index, int(self.t[index]), int(self.t[index - 1]))
         if (np.abs(self.p) != 1).any():
             index = int(np.argmax(np.abs(self.p) != 1))
-            raise DataError(
-                self.source,
-                f"event {index} has polarity {self.p[index]}",
-                "store polarities as -1 and +1 (from 0 and 1: 2 * p - 1)",
-            )
+            problem = f"event {index} has polarity {self.p[index]}"
+            raise DataError(self.source, problem, "store polarities as -1 and +1 (from 0 and 1: 2 * p - 1)")
 
     def __len__(self) -> int:
         return len(self.t)

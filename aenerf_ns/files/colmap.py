@@ -65,11 +65,8 @@ def read_colmap_poses(model: Path) -> dict[str, Tensor]:
     # Each image has its own camera where COLMAP was not told that there is one.
     num_cameras = len(set(cameras))
     if 1 < num_cameras < len(names):
-        raise DataError(
-            path,
-            f"its images are of {num_cameras} cameras, and how these are mounted on the event camera is not known",
-            "give a model of the images of one camera",
-        )
+        problem = f"its images are of {num_cameras} cameras, and how these are mounted on the event camera is not known"
+        raise DataError(path, problem, "give a model of the images of one camera")
     values = np.array(columns)
     world_to_camera = poses_from_quaternions(path, values[:, 4:7], values[:, [1, 2, 3, 0]])
     return dict(zip(names, torch.linalg.inv(world_to_camera), strict=True))

@@ -65,11 +65,8 @@ def open_array_events(path: Path, width: int, height: int, time_unit: TimeUnit |
     for layout in (XYTP_MEMBERS, POSITION_TIMESTAMP_POLARITY):
         if layout.arrays <= names:
             return ArrayEventFile(path, width, height, layout, time_unit)
-    raise DataError(
-        path,
-        f"its arrays are {', '.join(sorted(names)) or 'none'}",
-        "it must hold x, y, t and p, or position, timestamp and polarity",
-    )
+    problem = f"its arrays are {', '.join(sorted(names)) or 'none'}"
+    raise DataError(path, problem, "it must hold x, y, t and p, or position, timestamp and polarity")
 
 
 def read_npz_member(path: Path, name: str) -> NDArray:

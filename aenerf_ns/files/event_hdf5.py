@@ -89,9 +89,8 @@ class Hdf5TableFile(EventTableFile):
         if unit is not None and not (isinstance(unit, str) and unit in NANOSECONDS):
             raise DataError(self.path, f"its time unit is {unit!r}", f"use one of {', '.join(NANOSECONDS)}")
         if unit and self._given_unit not in (None, unit):
-            raise DataError(
-                self.path, f"it states its time unit, {unit!r}, but {self._given_unit} was given", "leave it out"
-            )
+            problem = f"it states its time unit, {unit!r}, but {self._given_unit} was given"
+            raise DataError(self.path, problem, "leave it out")
         return unit
 
 
@@ -108,9 +107,8 @@ class Hdf5EventFile(Hdf5TableFile):
         for name, dtype in _DTYPES.items():
             column = arrays[f"events/{name}"]
             if column.dtype != dtype:
-                raise DataError(
-                    self.path, f"/events/{name} has type {column.dtype}", f"store one row of {np.dtype(dtype).name}"
-                )
+                problem = f"/events/{name} has type {column.dtype}"
+                raise DataError(self.path, problem, f"store one row of {np.dtype(dtype).name}")
         return super()._length(arrays)
 
     def _columns(self, arrays: Mapping[str, Any], first: int, last: int | None) -> dict[str, NDArray]:
@@ -137,11 +135,8 @@ def open_hdf5_events(path: Path, width: int | None, height: int | None, time_uni
         for layout in _LAYOUTS:
             if all(_dataset(path, file, name) is not None for name in layout.arrays):
                 return Hdf5TableFile(path, *resolve_sensor_size(path, stated, width, height), layout, time_unit)
-        raise DataError(
-            path,
-            f"it holds {', '.join(sorted(file)) or 'nothing'}",
-            "events must be in /events/{x,y,t,p}, in /x, /y, /t and /p, in /CD/events, or in a matrix /events",
-        )
+        remedy = "events must be in /events/{x,y,t,p}, in /x, /y, /t and /p, in /CD/events, or in a matrix /events"
+        raise DataError(path, f"it holds {', '.join(sorted(file)) or 'nothing'}", remedy)
 
 
 def _open(path: Path) -> h5py.File:
@@ -291,9 +286,8 @@ class Hdf5EventWriter:
         if len(events) == 0:
             return
         if self._last_time is not None and events.t[0] < self._last_time:
-            raise DataError(
-                events.source, f"{events.t[0]} ns is before {self._last_time} ns", "sort the events by time"
-            )
+            problem = f"{events.t[0]} ns is before {self._last_time} ns"
+            raise DataError(events.source, problem, "sort the events by time")
         self._last_time = int(events.t[-1])
         self._waiting.append(events)
         self.num_events += len(events)

@@ -185,11 +185,8 @@ def resolve_sensor_size(
         remedy = "give its width and height in pixels, for a recording of your own in calibration.json"
         raise DataError(path, "the file does not state the size of its sensor", remedy)
     if stated is not None and (width, height) != stated:
-        raise DataError(
-            path,
-            f"its sensor has {stated[0]} x {stated[1]} pixels, but {width} x {height} were given",
-            "give the calibration of this camera",
-        )
+        problem = f"its sensor has {stated[0]} x {stated[1]} pixels, but {width} x {height} were given"
+        raise DataError(path, problem, "give the calibration of this camera")
     if width <= 0 or height <= 0:
         raise DataError(path, f"a sensor of {width} x {height} pixels cannot be", "give its width and height in pixels")
     return width, height

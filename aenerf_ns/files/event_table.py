@@ -90,17 +90,11 @@ class EventTableFile(EventFile):
             array, label = arrays[name], name or "the array"
             num_dimensions = 2 if isinstance(part, int) else 1
             if array.ndim != num_dimensions:
-                raise DataError(
-                    self.path,
-                    f"{label} has shape {tuple(array.shape)}",
-                    f"it must have {num_dimensions} dimension(s), the first that of the events",
-                )
+                remedy = f"it must have {num_dimensions} dimension(s), the first that of the events"
+                raise DataError(self.path, f"{label} has shape {tuple(array.shape)}", remedy)
             if isinstance(part, int) and array.shape[1] <= part:
-                raise DataError(
-                    self.path,
-                    f"{label} has {array.shape[1]} columns",
-                    f"column {part} must hold {column} of the events",
-                )
+                problem = f"{label} has {array.shape[1]} columns"
+                raise DataError(self.path, problem, f"column {part} must hold {column} of the events")
             if isinstance(part, str) and part not in (array.dtype.names or ()):
                 raise DataError(self.path, f"the records of {label} have no field {part}", FORMATS_REMEDY)
             lengths[name] = len(array)

@@ -178,11 +178,8 @@ class TextEventFile(EventFile):
         return list((fitting or _ORDERS)[0])
 
     def _unnamed(self, line: bytes) -> DataError:
-        return DataError(
-            self.path,
-            f"its first line is {line.decode('utf-8', 'replace').strip()[:60]!r}",
-            "it must name the columns, x, y, t and p among them, separated by commas or blanks",
-        )
+        remedy = "it must name the columns, x, y, t and p among them, separated by commas or blanks"
+        return DataError(self.path, f"its first line is {line.decode('utf-8', 'replace').strip()[:60]!r}", remedy)
 
     def read_assumed_unit(self) -> TimeUnit | None:
         unit = self._unit_of(self._ends())
@@ -244,9 +241,8 @@ class TextEventFile(EventFile):
         """Read the rest of a line."""
         line = file.readline(MAX_LINE)
         if len(line) == MAX_LINE:
-            raise DataError(
-                self.path, f"a line has more than {MAX_LINE:,} bytes", "write one event a line, as plain text"
-            )
+            problem = f"a line has more than {MAX_LINE:,} bytes"
+            raise DataError(self.path, problem, "write one event a line, as plain text")
         return line
 
     def _parse_block(self, text: bytes, num_before: int | None, names: list[str]) -> _Lines:

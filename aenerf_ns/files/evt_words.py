@@ -272,11 +272,8 @@ def decode_words(
             if position == len(block):
                 break
             if n + _MAX_PER_WORD <= CHUNK:
-                raise DataError(
-                    source,
-                    f"word {num_before + position} is {block[position]:#x}, which {encoding.name} does not have",
-                    "the file is damaged or in another encoding: copy or record it again",
-                )
+                problem = f"word {num_before + position} is {block[position]:#x}, which {encoding.name} does not have"
+                raise DataError(source, problem, "the file is damaged or in another encoding: copy or record it again")
             yield tuple(column[:n] for column in columns)  # type: ignore[misc]
             columns, n = _empty_columns(), 0
         num_before += len(block)

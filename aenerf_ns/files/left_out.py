@@ -82,11 +82,9 @@ class LeftOut:
         """Raise a DataError if so many events are left out that the file must have been read wrongly."""
         number = sum(self._counts.values())
         if number > max(_FEW, _MAX_SHARE * (num_kept + number)):
-            raise DataError(
-                source,
-                f"{number:,} of its {num_kept + number:,} events are malformed: {self.summary()}",
-                "only a thousandth may be left out: check the sensor's size, the format and the unit of the times",
-            )
+            problem = f"{number:,} of its {num_kept + number:,} events are malformed: {self.summary()}"
+            remedy = "only a thousandth may be left out: check the sensor's size, the format and the unit of the times"
+            raise DataError(source, problem, remedy)
 
 
 def _longest_ordered(times: NDArray[np.int64]) -> NDArray[np.bool_]:

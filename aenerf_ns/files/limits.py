@@ -68,15 +68,13 @@ def bounded(path: Path, kind: str, extra: str = "", size: int | None = None) -> 
     except FileNotFoundError as error:
         raise DataError(error.filename or path, "there is no such file", "check the path of the dataset") from error
     except ImportError as error:
-        raise DataError(
-            path, f"a package is missing to read it ({error})", f"pip install 'aenerf-ns[{extra}]'"
-        ) from error
+        problem = f"a package is missing to read it ({error})"
+        raise DataError(path, problem, f"pip install 'aenerf-ns[{extra}]'") from error
     # Libraries raise whatever they stumble over in a damaged file.
     except Exception as error:
         reason = error.strerror if isinstance(error, OSError) and error.strerror else error
-        raise DataError(
-            path, f"not a readable {kind} ({str(reason) or type(error).__name__})", "copy, record or write it again"
-        ) from error
+        problem = f"not a readable {kind} ({str(reason) or type(error).__name__})"
+        raise DataError(path, problem, "copy, record or write it again") from error
 
 
 def bounded_items(items: Iterator[Item], path: Path, kind: str, extra: str = "") -> Iterator[Item]:
@@ -137,11 +135,8 @@ def require_unpacked_size(path: Path, name: str, unpacked: int, packed: int) -> 
     ``name`` is what the message calls the data.
     """
     if unpacked > _max_unpacked(packed):
-        raise DataError(
-            path,
-            f"{name} unpacks to {unpacked:,} bytes or more, from {packed:,} in the file",
-            "it is damaged, or made to fill the memory: copy it again",
-        )
+        problem = f"{name} unpacks to {unpacked:,} bytes or more, from {packed:,} in the file"
+        raise DataError(path, problem, "it is damaged, or made to fill the memory: copy it again")
 
 
 def visible_files(folder: Path, pattern: str) -> list[Path]:
@@ -219,7 +214,6 @@ def file_inside(folder: Path, name: str, source: Path) -> Path:
     if not path.parts or "\0" in name:
         raise DataError(source, f"{name!r} is not a file name", "name the file")
     if path.is_absolute() or ".." in path.parts:
-        raise DataError(
-            source, f"it names {name}, outside the folder {folder}", "put the file, or a link to it, into the folder"
-        )
+        problem = f"it names {name}, outside the folder {folder}"
+        raise DataError(source, problem, "put the file, or a link to it, into the folder")
     return folder / path

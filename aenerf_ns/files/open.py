@@ -114,9 +114,6 @@ def _format(path: Path, beginning: bytes) -> str:
             return name
     # The first bytes of other files do not tell what they are.
     if by_suffix is None:
-        raise DataError(
-            path,
-            f"its format is not known (it begins with {beginning[:8]!r})",
-            "RAW (EVT2, EVT3), DAT, AEDAT4, bags of ROS, HDF5, npz, npy, csv and text are read, unpacked",
-        )
+        remedy = "RAW (EVT2, EVT3), DAT, AEDAT4, bags of ROS, HDF5, npz, npy, csv and text are read, unpacked"
+        raise DataError(path, f"its format is not known (it begins with {beginning[:8]!r})", remedy)
     return by_suffix

@@ -126,11 +126,8 @@ class PropheseeRawFile(EventFile):
             file.seek(self._begin)
             while len(block := np.fromfile(file, dtype, BLOCK)):
                 if len(block) >= _MAX_TIMELESS and not (encoding.kinds(block) == TIME_HIGH).any():
-                    raise DataError(
-                        self.path,
-                        f"{len(block):,} words without the upper bits of a time end at byte {file.tell():,}",
-                        "copy it again",
-                    )
+                    problem = f"{len(block):,} words without the upper bits of a time end at byte {file.tell():,}"
+                    raise DataError(self.path, problem, "copy it again")
                 yield block
 
 
@@ -140,11 +137,8 @@ def _encoding_name(path: Path, header: PropheseeHeader) -> str:
     version = header.fields.get("evt", "")
     name = options["name"] or {"2.0": "EVT2", "2.1": "EVT21", "3.0": "EVT3"}.get(version, version)
     if not name:
-        raise DataError(
-            path,
-            "its header does not state the encoding of the events",
-            'add the line "% evt 2.0" or "% evt 3.0", or convert it with metavision_file_to_dat',
-        )
+        remedy = 'add the line "% evt 2.0" or "% evt 3.0", or convert it with metavision_file_to_dat'
+        raise DataError(path, "its header does not state the encoding of the events", remedy)
     if name not in ("EVT2", "EVT3") or options.get("endianness", "little") != "little":
         raise DataError(
             path,
@@ -174,9 +168,8 @@ class PropheseeDatFile(EventFile):
             file.seek(header.end)
             kind = file.read(2)
         if len(kind) < 2 or kind[0] not in _EVENT_TYPES or kind[1] != _RECORD.itemsize:
-            raise DataError(
-                path, f"its records are of type and size {kind.hex(' ') or 'none'}, not events", "record it again"
-            )
+            problem = f"its records are of type and size {kind.hex(' ') or 'none'}, not events"
+            raise DataError(path, problem, "record it again")
         self._begin = header.end + len(kind)
         self._num_events, self._rest = divmod(path.stat().st_size - self._begin, _RECORD.itemsize)
 

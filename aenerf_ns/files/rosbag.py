@@ -121,9 +121,8 @@ class RosbagEventFile(EventFile):
         elif not self._is_ros2:
             with self.path.open("rb") as file:
                 if b"index_pos=" + bytes(8) in file.read(_ROS1_HEADER_BYTES):
-                    raise DataError(
-                        self.path, "it has no index, as if interrupted", f"rosbag reindex {shlex.quote(str(self.path))}"
-                    )
+                    problem = "it has no index, as if interrupted"
+                    raise DataError(self.path, problem, f"rosbag reindex {shlex.quote(str(self.path))}")
         with Ros2Reader(self.path) if self._is_ros2 else Ros1Reader(self.path) as reader:
             yield reader
 
@@ -140,9 +139,8 @@ class RosbagEventFile(EventFile):
                 try:
                     message = _parse(data, connection.msgtype in _PACKET_TYPES, self._is_ros2)
                 except struct.error:
-                    raise DataError(
-                        self.path, f"a message of {topic} does not have the parts of its type", "copy it again"
-                    ) from None
+                    problem = f"a message of {topic} does not have the parts of its type"
+                    raise DataError(self.path, problem, "copy it again") from None
                 # Zeros are what a message has that states no size.
                 stated = (message.width, message.height) if message.width or message.height else None
                 self._size = resolve_sensor_size(self.path, stated, *self._size)
@@ -179,11 +177,8 @@ class RosbagEventFile(EventFile):
 
     def _words(self, message: _Message) -> NDArray[np.uint16]:
         if message.encoding != "evt3":
-            raise DataError(
-                self.path,
-                f"its packets are encoded as {message.encoding!r}; evt3 is read",
-                "republish them as dvs_msgs/EventArray with event_camera_tools",
-            )
+            problem = f"its packets are encoded as {message.encoding!r}; evt3 is read"
+            raise DataError(self.path, problem, "republish them as dvs_msgs/EventArray with event_camera_tools")
         if len(message.content) % _WORD.itemsize:
             raise DataError(self.path, "a packet ends within a word", "copy it again")
         # Copied, so that the decoder is compiled for one kind of array.
@@ -260,9 +255,8 @@ def _choose(path: Path, types: dict[str, str], topic: str | None) -> str:
         return topic
     if not known:
         found = ", ".join(sorted({kind.replace("/msg/", "/") for kind in types.values()})) or "nothing"
-        raise DataError(
-            path, f"no topic holds events; the bag holds {found}", "EventArray of dvs_msgs and EventPacket are read"
-        )
+        problem = f"no topic holds events; the bag holds {found}"
+        raise DataError(path, problem, "EventArray of dvs_msgs and EventPacket are read")
     problem = "several topics hold events" if topic is None else f"topic {topic} holds no events"
     raise DataError(path, problem, f"choose one of {', '.join(known)} as topic")
 

@@ -103,9 +103,8 @@ def parse_times(path: Path, fields: Sequence[str], unit: TimeUnit = "s") -> NDAr
             good = False
         if not good:
             name = UNIT_NAMES[unit]
-            raise DataError(
-                path, f"{field[:40]} is not a time in {name}", f"write plain decimal {name}, not another unit"
-            )
+            problem = f"{field[:40]} is not a time in {name}"
+            raise DataError(path, problem, f"write plain decimal {name}, not another unit")
         times[index] = int(time.to_integral_value())
     return times
 

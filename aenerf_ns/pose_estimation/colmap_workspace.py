@@ -139,11 +139,8 @@ class ColmapWorkspace:
             origin = frame if isinstance(frame, Path) else f"{source}, frame {int(Path(name).stem)}"
             with read_image(frame) if isinstance(frame, Path) else Image.fromarray(frame) as image:
                 if image.size != size:
-                    raise DataError(
-                        origin,
-                        f"the frame has {image.width} x {image.height} pixels, its camera {size[0]} x {size[1]}",
-                        "give the intrinsics of the frames as they are",
-                    )
+                    problem = f"the frame has {image.width} x {image.height} pixels, its camera {size[0]} x {size[1]}"
+                    raise DataError(origin, problem, "give the intrinsics of the frames as they are")
                 require_8_bits(image, origin)
                 image.convert("L" if image.mode == "L" else "RGB").save(self._images / name)
             self._content.update((self._images / name).read_bytes())

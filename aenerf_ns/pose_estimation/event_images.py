@@ -106,11 +106,8 @@ def images_of_events(
     num_events = round(_BATCHES * EVENTS_PER_PIXEL * num_pixels)
     images = make_images(num_events, None)
     if len(images) < MIN_IMAGES:
-        raise DataError(
-            events.path,
-            f"its events make {len(images)} images of {num_events:,} events each",
-            f"poses can be estimated from {MIN_IMAGES} images or more: record for longer, or widen the time window",
-        )
+        remedy = f"poses can be estimated from {MIN_IMAGES} images or more: record for longer, or widen the time window"
+        raise DataError(events.path, f"its events make {len(images)} images of {num_events:,} events each", remedy)
     share = _MAX_MOTION / max(_motion([image for _, image in images]), _MAX_MOTION)
     drift = None
     if weights is None:

@@ -94,11 +94,8 @@ def refine_poses(
         # Time and memory grow with the number's third and second power.
         images = images[:: math.ceil(len(images) / _MAX_IMAGES) or 1]
         if len(images) < MIN_IMAGES:
-            raise DataError(
-                source,
-                f"only {len(images)} of {len(all_times)} images of its events are from the time of its poses",
-                "check that events and poses share one clock: aenerf check",
-            )
+            problem = f"only {len(images)} of {len(all_times)} images of its events are from the time of its poses"
+            raise DataError(source, problem, "check that events and poses share one clock: aenerf check")
         times = all_times[images]
         poses = given.interpolate(times).numpy()
 

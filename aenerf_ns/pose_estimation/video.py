@@ -83,11 +83,8 @@ def open_video(source: Path, frame_rate: float | None = None) -> Video:
     backward = np.flatnonzero(np.diff(times) <= 0)
     if len(backward):
         later = int(backward[0]) + 1
-        raise DataError(
-            source,
-            f"frame {later} is at {times[later]} ns, not after the frame before it at {times[later - 1]} ns",
-            "sort the frames by time, or state their rate as --frame-rate",
-        )
+        problem = f"frame {later} is at {times[later]} ns, not after the frame before it at {times[later - 1]} ns"
+        raise DataError(source, problem, "sort the frames by time, or state their rate as --frame-rate")
     return Video(source, video.width, video.height, times, video.read_frames)
 
 

@@ -99,11 +99,8 @@ class EventDataParser(DataParser):
             DataError: a file is missing or its content cannot be used, or the lens is not known.
         """
         if self._recording.intrinsics_origin == "guessed":
-            raise DataError(
-                self.data,
-                "the intrinsics of the event camera are not known",
-                f"calibrate it, or have them estimated together with poses: {_ESTIMATE}",
-            )
+            remedy = f"calibrate it, or have them estimated together with poses: {_ESTIMATE}"
+            raise DataError(self.data, "the intrinsics of the event camera are not known", remedy)
         return self._recording
 
     @cached_property
@@ -142,22 +139,16 @@ class EventDataParser(DataParser):
     def _check_lens(self, camera: CameraIntrinsics, name: str) -> None:
         """Raise a DataError for a lens whose distortion cannot be inverted at any pixel."""
         if not camera.has_valid_pixels():
-            raise DataError(
-                self.data,
-                f"the {name} sees nothing: its distortion {list(camera.distortion)} can be inverted at no pixel",
-                "check the order and the model of its parameters",
-            )
+            problem = f"the {name} sees nothing: its distortion {list(camera.distortion)} can be inverted at no pixel"
+            raise DataError(self.data, problem, "check the order and the model of its parameters")
 
     def _generate_dataparser_outputs(self, split: Split = "train", **kwargs: object) -> DataparserOutputs:
         recording = self.recording
         window = self.time_window
         refractory = recording.sensor.refractory_period
         if refractory >= window.end - window.start:
-            raise DataError(
-                self.data,
-                f"the refractory period of {refractory} ns is longer than the recording",
-                "give it in nanoseconds",
-            )
+            problem = f"the refractory period of {refractory} ns is longer than the recording"
+            raise DataError(self.data, problem, "give it in nanoseconds")
         transform, scale, scene_box = self._world_transform(
             recording.trajectory.crop(window.start, window.end), recording.scene_box
         )
@@ -233,11 +224,8 @@ class EventDataParser(DataParser):
         if start == end and config.start_time_ns is None and config.end_time_ns is None:
             raise DataError(str(config.data), f"all its events are at {start} ns", "check the unit of the times")
         if start >= end:
-            raise DataError(
-                str(config.data),
-                f"nothing is left from {start} to {end} ns",
-                "widen the time window (--start-time-ns, --end-time-ns)",
-            )
+            problem = f"nothing is left from {start} to {end} ns"
+            raise DataError(str(config.data), problem, "widen the time window (--start-time-ns, --end-time-ns)")
         covered = recording.trajectory.crop(start, end)
         start, end = max(start, covered.start), min(end, covered.end)
         return TimeWindow(start, end, self._pose_gaps(recording, start, end))
@@ -278,11 +266,8 @@ class EventDataParser(DataParser):
         if box is not None:
             center, half = (box[0] + box[1]) / 2, (box[1] - box[0]) / 2
             if not (half > _MIN_BOX).all() or not (box.abs() < _MAX_BOX).all():
-                raise DataError(
-                    self.data,
-                    f"the scene box has the corners {box.tolist()}",
-                    f"give a box that holds the scene, with sides of {_MIN_BOX:g} to {_MAX_BOX:g}",
-                )
+                remedy = f"give a box that holds the scene, with sides of {_MIN_BOX:g} to {_MAX_BOX:g}"
+                raise DataError(self.data, f"the scene box has the corners {box.tolist()}", remedy)
             transform = torch.cat([torch.eye(3, dtype=torch.float64), -center[:, None]], -1)
             scale = self.config.scale_factor / float(half.max())
             return transform, scale, torch.stack([-half, half]) * scale
@@ -298,11 +283,9 @@ class EventDataParser(DataParser):
         if self.config.auto_scale_poses:
             extent = float(oriented[:, :3, 3].abs().max())
             if extent < 1e-6:
-                raise DataError(
-                    trajectory.source,
-                    f"the camera moves by no more than {extent:.2g}, which gives the scene no scale",
-                    "record with a moving camera, or give --auto-scale-poses False",
-                )
+                problem = f"the camera moves by no more than {extent:.2g}, which gives the scene no scale"
+                remedy = "record with a moving camera, or give --auto-scale-poses False"
+                raise DataError(trajectory.source, problem, remedy)
             scale /= extent
         return transform, scale, torch.tensor([[-1.0] * 3, [1.0] * 3])
 

@@ -141,9 +141,8 @@ class PairFile:
         except OSError as error:
             if error.errno not in (errno.ENOSPC, errno.EDQUOT):
                 raise
-            raise DataError(
-                self.path, "the disk is full", "free some of it: the pairs take 16 bytes an event, twice that at first"
-            ) from None
+            remedy = "free some of it: the pairs take 16 bytes an event, twice that at first"
+            raise DataError(self.path, "the disk is full", remedy) from None
         finally:
             if self._new is not None:
                 # Fails once more on a full disk.

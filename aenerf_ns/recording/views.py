@@ -87,9 +87,8 @@ def read_image_times(folder: Path, path: Path, unit: TimeUnit) -> list[tuple[int
         return []
     times = parse_times(path, [row[0] for row in read_rows(path, "t")[0]], unit).tolist()
     if len(files) != len(times):
-        raise DataError(
-            path, f"it has {len(times)} times for {len(files)} images", "copy all images and the list of their times"
-        )
+        problem = f"it has {len(times)} times for {len(files)} images"
+        raise DataError(path, problem, "copy all images and the list of their times")
     return list(zip(times, files, strict=True))
 
 

@@ -78,10 +78,9 @@ class _FolderWriter(ABC):
             if error_type is None:
                 self._finish()
                 self._partial.rename(self._folder)
-        except OSError as problem:
-            raise DataError(
-                self._folder, f"it cannot be written ({reason(problem)})", "check the space and the rights"
-            ) from None
+        except OSError as failure:
+            problem = f"it cannot be written ({reason(failure)})"
+            raise DataError(self._folder, problem, "check the space and the rights") from None
         finally:
             self._cleanup.close()
 

@@ -166,11 +166,8 @@ class Simulation:
         estimated, errors = compare_with_truth(found.trajectory, true_poses)
         knots = truth.knots_between(estimated.start, estimated.end)
         if len(knots) < 2:
-            raise DataError(
-                "aenerf simulate",
-                f"COLMAP's poses span {len(estimated)} frames, and fewer than two of the true poses",
-                "give a higher --pose-rate",
-            )
+            problem = f"COLMAP's poses span {len(estimated)} frames, and fewer than two of the true poses"
+            raise DataError("aenerf simulate", problem, "give a higher --pose-rate")
         between = pose_errors(estimated.interpolate(knots), truth.interpolate(knots))
         settings = {"frame_rate": frame_rate, "exposure_seconds": exposure}
         report = {**settings, **found.report(), "errors": errors, "errors_between_frames": between}
