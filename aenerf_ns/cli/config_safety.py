@@ -38,10 +38,9 @@ def require_known_names(config: Path) -> None:
     A name must be of a class. Nothing is called but paths and enumerations. So no function of these packages runs
     because the file says so.
     """
+    text = read_yaml_text(config, _MAX_BYTES)
     try:
-        events = list(yaml.parse(read_yaml_text(config, _MAX_BYTES), Loader=yaml.Loader))
-    except DataError:
-        raise
+        events = list(yaml.parse(text, Loader=yaml.Loader))
     except YAML_ERRORS as error:
         raise DataError(config, f"it cannot be read ({error})", _REMEDY) from None
     tagged = [(index, event) for index, event in enumerate(events) if getattr(event, "tag", None) is not None]

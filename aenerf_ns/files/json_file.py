@@ -43,16 +43,15 @@ def read_json(path: Path, kind: type[T], remedy: str = DATASET_REMEDY) -> T:
         DataError: the file is missing or too large, is not JSON, has a key twice or a number that is too large, or
             holds something else than ``kind``.
     """
+    text = read_text(path, _MAX_BYTES)
     try:
         values = json.loads(
-            read_text(path, _MAX_BYTES),
+            text,
             parse_float=_parse_decimal,
             parse_int=_parse_integer,
             parse_constant=_refuse_constant,
             object_pairs_hook=_make_object,
         )
-    except DataError:
-        raise
     except (ValueError, RecursionError) as error:
         raise DataError(path, f"not valid JSON ({error})", "correct it there") from None
     return convert(path, values, kind, remedy)

@@ -54,11 +54,9 @@ def read_plain_yaml(path: Path, max_bytes: int = _MAX_BYTES) -> Any:
     Raises:
         DataError: the file is missing, too large, or not valid YAML, or it has aliases.
     """
+    # OpenCV's first line is no YAML, and rostopic's last line ends a message.
+    text = read_yaml_text(path, max_bytes).removeprefix("%YAML:1.0").rstrip().removesuffix("\n---")
     try:
-        # OpenCV's first line is no YAML, and rostopic's last line ends a message.
-        text = read_yaml_text(path, max_bytes).removeprefix("%YAML:1.0").rstrip().removesuffix("\n---")
         return yaml.load(text, _Loader)
-    except DataError:
-        raise
     except YAML_ERRORS as error:
         raise DataError(path, f"not valid YAML ({' '.join(str(error).split())})", "correct that line") from None
