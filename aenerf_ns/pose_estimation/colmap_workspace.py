@@ -207,7 +207,7 @@ class ColmapWorkspace:
             if not is_placed(model):
                 return None
         self._store_intrinsics(model)
-        with contextlib.closing(pycolmap.Database.open(self._database)) as database:
+        with pycolmap.Database.open(self._database) as database:
             database.clear_two_view_geometries()
         with self._step("Verifying matches"):
             pycolmap.verify_matches(self._database, self._pairs, self._verification())
@@ -216,7 +216,7 @@ class ColmapWorkspace:
     def _store_intrinsics(self, model: Any) -> None:
         (camera,) = model.cameras.values()
         camera.has_prior_focal_length = True
-        with contextlib.closing(pycolmap.Database.open(self._database)) as database:
+        with pycolmap.Database.open(self._database) as database:
             database.update_camera(camera)
 
     def _verification(self) -> Any:
@@ -228,7 +228,7 @@ class ColmapWorkspace:
 
     def hold_out_matches(self, share: float) -> HeldOutMatches:
         """Take the matches of a share of the pairs of frames out of the database, to judge models by."""
-        with contextlib.closing(pycolmap.Database.open(self._database)) as database:
+        with pycolmap.Database.open(self._database) as database:
             camera = database.read_all_cameras()[0]
             pair_ids, geometries = database.read_two_view_geometries()
             chosen = np.random.default_rng(self._seed).random(len(pair_ids)) < share
@@ -297,7 +297,7 @@ class ColmapWorkspace:
             max_pixels: reprojection error beyond which an observation belongs to no point.
             max_degrees: the same as an angle between rays.
         """
-        with contextlib.closing(pycolmap.Database.open(self._database)) as database:
+        with pycolmap.Database.open(self._database) as database:
             numbers = {image.name: image.image_id for image in database.read_all_images()}
             (camera,) = database.read_all_cameras()
         posed = pycolmap.Reconstruction()
@@ -351,7 +351,7 @@ class ColmapWorkspace:
 
     def count_features_and_pairs(self) -> tuple[float, int]:
         """Return the median number of features in a frame, and the number of pairs of frames that match."""
-        with contextlib.closing(pycolmap.Database.open(self._database)) as database:
+        with pycolmap.Database.open(self._database) as database:
             counts = [database.num_keypoints_for_image(image.image_id) for image in database.read_all_images()]
             # COLMAP's own count has the pairs without a match too.
             return statistics.median(counts) if counts else 0.0, len(database.read_two_view_geometry_num_inliers()[0])
