@@ -257,8 +257,6 @@ class Hdf5EventWriter:
                 compression="gzip",
                 compression_opts=1,
                 shuffle=True,
-                # Equal events make equal files.
-                track_times=False,
             )
             for name, dtype in _DTYPES.items()
         }
