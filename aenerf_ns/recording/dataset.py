@@ -60,14 +60,11 @@ class EventDataset(InputDataset):
             DataError: the event file is missing or malformed, or no event lies in the time window.
         """
         scene = self.scene
-        events, camera = scene.event_file, scene.event_camera
+        events, window, period = scene.event_file, scene.window, scene.sensor.refractory_period
         events.require()
-        _, usable = camera.pixel_directions()
-        made_from = {
-            "refractory_period": scene.sensor.refractory_period,
-            "window": [scene.window.start, scene.window.end, scene.window.gaps],
-            "usable": zlib.crc32(usable.data),
-        }
+        _, usable = scene.event_camera.pixel_directions()
+        bounds = [window.start, window.end, window.gaps]
+        made_from = {"refractory_period": period, "window": bounds, "usable": zlib.crc32(usable.data)}
         file, count = PairFile(events, made_from), events.count()
         # Imported lazily: every ns-* command imports this module, and numba is slow to import.
         from aenerf_ns.events.pairing import EVENTS_IN_MEMORY, pair_events
@@ -80,11 +77,7 @@ class EventDataset(InputDataset):
                 if pairs is None:
                     read = events.path
                     pairs = pair_events(
-                        scene.event_file.tracked(),
-                        refractory_period=scene.sensor.refractory_period,
-                        window=scene.window,
-                        usable=usable,
-                        open_file=file.open,
+                        events.tracked(), refractory_period=period, window=window, usable=usable, open_file=file.open
                     )
                     if len(pairs) > 0:
                         file.keep(pairs)

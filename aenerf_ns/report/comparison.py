@@ -92,15 +92,7 @@ def paired_differences(reports: Sequence[RunReport], shared: Sequence[str]) -> l
                 if len(differences):
                     mean, count = float(differences.mean()), len(differences)
                     half = float(stats.t.ppf(0.975, count - 1) * stats.sem(differences)) if count > 1 else None
-                    rows.append(
-                        {
-                            "run": other.name,
-                            "minus": first.name,
-                            "test_poses": protocol,
-                            "metric": metric,
-                            "num_views": count,
-                            "mean": mean,
-                            "interval": None if half is None else (mean - half, mean + half),
-                        }
-                    )
+                    interval = None if half is None else (mean - half, mean + half)
+                    row = {"run": other.name, "minus": first.name, "test_poses": protocol, "metric": metric}
+                    rows.append({**row, "num_views": count, "mean": mean, "interval": interval})
     return rows

@@ -29,8 +29,7 @@ class RunPoses:
         evo: :func:`evo_errors` of the ``estimated`` and the ``corrected`` poses,
             over all of them. None without true poses.
         errors: :func:`errors_over_time` of both. None without true poses.
-        correction: see :func:`correction_components`. None where poses are not
-            corrected.
+        correction: see :func:`correction_components`. None where poses are not corrected.
     """
 
     num_poses: int
