@@ -63,9 +63,8 @@ def test_frame_without_pose_gets_that_of_its_time(tmp_path: Path) -> None:
 def test_options_replace_values_of_the_sensor(tmp_path: Path) -> None:
     folder = write_native(tmp_path / "made")
     options = {"positive_contrast_threshold": 0.7, "refractory_period_ns": 0, "bandwidth_hz": 0.0}
-    assert parse(NativeDataParserConfig(data=folder, **options)).metadata[SCENE_KEY].sensor == SensorModel(
-        0.7, 0.2, 0, "RGGB"
-    )
+    scene = parse(NativeDataParserConfig(data=folder, **options)).metadata[SCENE_KEY]
+    assert scene.sensor == SensorModel(0.7, 0.2, 0, "RGGB")
     with pytest.raises(DataError, match=r"positive_contrast_threshold must be from 0.0001 to 1000, not 0; .*options"):
         parse(NativeDataParserConfig(data=folder, positive_contrast_threshold=0.0))
 

@@ -147,7 +147,7 @@ class SimulatedCuda(TorchDispatchMode):
 
 
 def to_device(value: Any) -> Any:
-    """Return what a value holds on the device, uncounted: a tensor, or or a dictionary or dataclass of tensors.
+    """Return what a value holds on the device, uncounted: a tensor, or a dictionary or dataclass of tensors.
 
     A module is moved in place. Within a ``FakeTensorMode`` the tensors lose their values.
     """
