@@ -76,10 +76,9 @@ class NativeDataParser(EventDataParser):
         camera = meta.event_camera.intrinsics()
         if meta.event_camera.file is None:
             raise DataError(path, "event_camera: missing field file", "name the file of the events there")
+        events = file_inside(path.parent, meta.event_camera.file, path)
         capture = Capture(
-            event_file=Hdf5EventFile(
-                file_inside(path.parent, meta.event_camera.file, path), camera.width, camera.height
-            ),
+            event_file=Hdf5EventFile(events, camera.width, camera.height),
             event_camera=camera,
             sensor=self._sensor(path, meta.event_camera),
             frame_camera=frame_camera,

@@ -96,9 +96,8 @@ class OwnRecordingDataParser(EventDataParser):
             reference = _read_colmap(poses, timed, self._image_list, frame_from_event, capture)
         else:
             reference = read_tum_trajectory(poses)
-        views = views_on_trajectory(
-            timed, reference, torch.linalg.inv(frame_from_event), max_pose_gap=config.max_pose_gap_ns
-        )
+        event_from_frame = torch.linalg.inv(frame_from_event)
+        views = views_on_trajectory(timed, reference, event_from_frame, max_pose_gap=config.max_pose_gap_ns)
         return config.make_recording(reference, capture, reference_views=views)
 
     def poses_path(self) -> Path:

@@ -134,9 +134,9 @@ def _pinhole(matrix: Matrix3) -> tuple[float, float, float, float]:
 def _read_poses(path: Path) -> Trajectory:
     arrays = {name: read_npz_member(path, f"T_wc_{name}") for name in ("position", "orientation", "timestamp")}
     length = arrays["timestamp"].size
-    for (name, array), shape, kinds in zip(
-        arrays.items(), ((length, 3), (length, 4), (length,)), ("iuf", "iuf", "iu"), strict=True
-    ):
+    expected = {"position": ((length, 3), "iuf"), "orientation": ((length, 4), "iuf"), "timestamp": ((length,), "iu")}
+    for name, (shape, kinds) in expected.items():
+        array = arrays[name]
         if array.shape != shape or array.dtype.kind not in kinds:
             remedy = f"it must hold {' x '.join(map(str, shape))} numbers, for {length} integer times in nanoseconds"
             raise DataError(path, f"T_wc_{name} has type {array.dtype} and shape {array.shape}", remedy)

@@ -106,9 +106,8 @@ def check_contrast(result: CheckResult, warped: WarpedEvents, is_simple: bool) -
 
 def check_depth(result: CheckResult, warped: WarpedEvents, recording: Recording, scale: float) -> None:
     """Describe how far away the scene is, and check that the scene box holds it."""
-    energy, brightness, depth, point = (
-        np.stack([getattr(part, name) for part in warped.given]) for name in ("energy", "brightness", "depth", "points")
-    )
+    names = "energy", "brightness", "depth", "points"
+    energy, brightness, depth, point = (np.stack([getattr(part, name) for part in warped.given]) for name in names)
     trusted = (energy > _MIN_TILE_CONTRAST * contrast_of(warped.given) * brightness) & np.isfinite(depth)
     weight, depth, point = energy[trusted], depth[trusted], point[trusted]
     if len(depth) == 0:

@@ -188,9 +188,8 @@ class Convert(DatasetCommand):
             raise DataError(self.data, problem, "give the times of the frames in seconds on the clock of the events")
         lens = capture.event_camera
         camera = (lens.width, lens.height) if capture.intrinsics_origin == "guessed" else lens
-        return _with_poses(
-            estimate_poses(files, times, camera, self.data, self.seed, self._colmap_folder), capture, kept
-        )
+        found = estimate_poses(files, times, camera, self.data, self.seed, self._colmap_folder)
+        return _with_poses(found, capture, kept)
 
     def _with_refined_poses(
         self, parser: EventDataParser, recording: Recording, window: TimeWindow
@@ -203,18 +202,15 @@ class Convert(DatasetCommand):
         given, truth = recording.trajectory, recording.ground_truth
         knots = None if truth is None else given.knots_covered_by(truth)
         found = refine_poses(recording, window, self.data, self.seed, self.weights, self._colmap_folder)
-        report = found.report
+        report, refined = found.report, found.trajectory
         say(report["summary"])
-        paths = {"given": given.camera_to_worlds.numpy(), "refined": found.trajectory.camera_to_worlds.numpy()}
+        paths = {"given": given.camera_to_worlds.numpy(), "refined": refined.camera_to_worlds.numpy()}
         if truth is None or knots is None:
-            views = {
-                split: move_views(views, given, found.trajectory) for split, views in recording.reference_views.items()
-            }
+            views = {split: move_views(views, given, refined) for split, views in recording.reference_views.items()}
             recording = replace(recording, reference_views=views)
         else:
-            before, after = (
-                pose_errors(poses.interpolate(knots), truth.interpolate(knots)) for poses in (given, found.trajectory)
-            )
+            true = truth.interpolate(knots)
+            before, after = (pose_errors(poses.interpolate(knots), true) for poses in (given, refined))
             report |= {"errors_given": before, "errors": after}
             say(
                 f"Compared with the ground truth: mean errors {before['rotation_error_degrees']:.2f} degrees and "

@@ -68,9 +68,8 @@ def event_statistics(
         # Integers are exact up to 292 years. Seconds since 1970 in float64 would put events into other parts.
         part = (chunk.t - start) // max(-(-(end - start + 1) // num_parts), 1)
         rate += np.bincount(part.clip(0, num_parts - 1), minlength=num_parts)
-    return EventStatistics(
-        counts.reshape(height, width), num_positive, num_repeated, rate, sample[: state[1]].copy(), start, end
-    )
+    pair_times = sample[: state[1]].copy()
+    return EventStatistics(counts.reshape(height, width), num_positive, num_repeated, rate, pair_times, start, end)
 
 
 @numba.njit(cache=True)

@@ -149,9 +149,8 @@ class EventDataParser(DataParser):
         if refractory >= window.end - window.start:
             problem = f"the refractory period of {refractory} ns is longer than the recording"
             raise DataError(self.data, problem, "give it in nanoseconds")
-        transform, scale, scene_box = self._world_transform(
-            recording.trajectory.crop(window.start, window.end), recording.scene_box
-        )
+        cropped = recording.trajectory.crop(window.start, window.end)
+        transform, scale, scene_box = self._world_transform(cropped, recording.scene_box)
         rotation, translation = transform.split((3, 1), -1)
         frame = Similarity(torch.tensor(scale, dtype=torch.float64), rotation, scale * translation[:, 0])
 

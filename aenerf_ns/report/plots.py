@@ -50,9 +50,8 @@ def curves(reports: Sequence[RunReport]) -> go.Figure | None:
         return None
     columns = 2
     rows = -(-len(panels) // columns)
-    figure = make_subplots(
-        rows, columns, subplot_titles=[title for _, title, _ in panels], vertical_spacing=0.5 / rows / 2
-    )
+    titles = [title for _, title, _ in panels]
+    figure = make_subplots(rows, columns, subplot_titles=titles, vertical_spacing=0.25 / rows)
     for index, (name, _, logarithmic) in enumerate(panels):
         row, column = index // columns + 1, index % columns + 1
         for run, (report, scalars) in enumerate(zip(reports, kept, strict=True)):
@@ -182,11 +181,9 @@ def changes(pairs: PairResiduals) -> go.Figure:
         )
     )  # fmt: skip
     figure.add_scatter(x=edges[[0, -1]], y=edges[[0, -1]], mode="lines", line={"color": "#d62728", "dash": "dot"})
-    figure.update_layout(
-        xaxis_title="measured change (thresholds)", yaxis_title="rendered change (thresholds)", showlegend=False
-    )
-    figure.update_yaxes(scaleanchor="x", constrain="domain")
-    figure.update_xaxes(constrain="domain")
+    figure.update_xaxes(title_text="measured change (thresholds)", constrain="domain")
+    figure.update_yaxes(title_text="rendered change (thresholds)", scaleanchor="x", constrain="domain")
+    figure.update_layout(showlegend=False)
     return _style(figure, 440)
 
 

@@ -83,17 +83,8 @@ def _pictures(outputs: dict[str, Any], truth: torch.Tensor, scale: float) -> Vie
     error = (rendering - truth).abs().mean(-1, keepdim=True)
     # torch.quantile takes at most 2^24 values.
     seen = depth[outputs["accumulation"] > 0.5][:: -(-depth.numel() // 2**24)]
-    near, far = (
-        torch.quantile(seen, seen.new_tensor([_MAX_BEYOND, 1 - _MAX_BEYOND])).tolist() if len(seen) else (0.0, 1.0)
-    )
-    return ViewPictures(
-        to_image(truth),
-        to_image(rendering),
-        to_image(colormaps.apply_colormap((error / ERROR_RANGE).clamp(0, 1), colormaps.ColormapOptions("inferno"))),
-        to_image(
-            colormaps.apply_depth_colormap(
-                depth, accumulation=outputs["accumulation"], near_plane=near, far_plane=max(far, near + 1e-9)
-            )
-        ),
-        (near, far),
-    )
+    shares = seen.new_tensor([_MAX_BEYOND, 1 - _MAX_BEYOND])
+    near, far = torch.quantile(seen, shares).tolist() if len(seen) else (0.0, 1.0)
+    errors = colormaps.apply_colormap((error / ERROR_RANGE).clamp(0, 1), colormaps.ColormapOptions("inferno"))
+    depths = colormaps.apply_depth_colormap(depth, outputs["accumulation"], near, max(far, near + 1e-9))
+    return ViewPictures(to_image(truth), to_image(rendering), to_image(errors), to_image(depths), (near, far))
