@@ -309,9 +309,8 @@ def test_the_events_of_a_bare_file_are_checked(room: Path, tmp_path: Path) -> No
     )
     assert f"There are no poses at {tmp_path / 'trajectory.txt'}. Find them with: {command}-threshold=0.5\n" in output
     # The files beside the event file are parts of the recording.
-    (tmp_path / "calibration.json").write_text(
-        json.dumps({"event_camera": {**camera, "cx": camera["cy"], "cy": camera["cx"]}})
-    )
+    swapped = {**camera, "cx": camera["cy"], "cy": camera["cx"]}
+    (tmp_path / "calibration.json").write_text(json.dumps({"event_camera": swapped}))
     status, output = run(file)
     assert status == 1
     assert "x and y swapped" in output

@@ -323,9 +323,8 @@ def test_print_the_command_to_train_with(tmp_path: Path) -> None:
         folder = tmp_path / f"made {source.name}"
         with CONSOLE.capture() as output:
             Convert(source, folder).main()
-        assert (
-            f"Look it over with: aenerf check '{folder}'\nTrain with: ns-train aenerf --data '{folder}'" in output.get()
-        )
+        advice = f"Look it over with: aenerf check '{folder}'\nTrain with: ns-train aenerf --data '{folder}'"
+        assert advice in output.get()
         # The dataset states the scale, so that every command takes the same.
         parser = NativeDataParserConfig(data=folder).setup()
         parser.get_dataparser_outputs("train")

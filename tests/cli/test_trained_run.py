@@ -97,9 +97,8 @@ def test_foreign_names_are_refused(
 )
 def test_run_of_another_version_is_named(text: str, tmp_path: Path) -> None:
     (tmp_path / "config.yml").write_text(text)
-    with pytest.raises(
-        DataError, match=r"line 1 names aenerf_ns\S+, which this version does not have; open it with the version"
-    ):
+    message = r"line 1 names aenerf_ns\S+, which this version does not have; open it with the version"
+    with pytest.raises(DataError, match=message):
         require_known_names(tmp_path / "config.yml")
 
 

@@ -122,9 +122,8 @@ def test_run_opens_without_events_and_elsewhere(
 
 
 def test_unknown_format_names_the_known_ones(tmp_path: Path) -> None:
-    with pytest.raises(
-        DataError, match=r"no known format of recordings; looked for .*raw_events.npz.*H5_Files"
-    ) as error:
+    message = r"no known format of recordings; looked for .*raw_events.npz.*H5_Files"
+    with pytest.raises(DataError, match=message) as error:
         recognize(tmp_path)
     for name in FORMATS:
         assert name in str(error.value)

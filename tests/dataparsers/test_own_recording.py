@@ -141,9 +141,8 @@ def test_a_recording_may_be_given_by_its_event_file(truth: Truth) -> None:
 def test_refuse_the_event_file_of_another_format(tmp_path: Path) -> None:
     for name in ("events.txt", "calib.txt"):
         (tmp_path / name).touch()
-    with pytest.raises(
-        DataError, match=r"events.txt: it belongs to a recording in the format ecd-data; give the folder"
-    ):
+    message = r"events.txt: it belongs to a recording in the format ecd-data; give the folder"
+    with pytest.raises(DataError, match=message):
         recognize(tmp_path / "events.txt")
 
 

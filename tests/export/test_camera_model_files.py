@@ -74,9 +74,8 @@ def test_pycolmap_reads_the_model(name: str, tmp_path: Path, random_poses: torch
 
 def assert_read(outputs: DataparserOutputs, images: list[PlacedImage], points: ObservedPoints, folder: Path) -> None:
     """Asserts that a dataparser of the framework gives images, in the world that they were written in."""
-    assert [Path(file).relative_to(folder / "images").as_posix() for file in outputs.image_filenames] == [
-        image.name for image in images
-    ]
+    names = [Path(file).relative_to(folder / "images").as_posix() for file in outputs.image_filenames]
+    assert names == [image.name for image in images]
     # The inverse of the dataparser's own transform.
     found = outputs.transform_poses_to_original_space(outputs.cameras.camera_to_worlds, camera_convention="opencv")
     expected = np.stack([image.camera_to_world[:3] for image in images])

@@ -48,9 +48,8 @@ def test_place_images_at_corrected_poses(run: TrainedRun) -> None:
     timed, untimed = placed[2][0].camera_to_world, placed[3][0].camera_to_world
     given = recording.reference_views["test"]
     corrected = corrected_poses(run, torch.tensor([SECOND // 4]))[0]
-    on_rig = (
-        np.linalg.inv(homogeneous(recording.trajectory.interpolate(SECOND // 4))) @ given[0].camera_to_world.numpy()
-    )
+    rig = homogeneous(recording.trajectory.interpolate(SECOND // 4))
+    on_rig = np.linalg.inv(rig) @ given[0].camera_to_world.numpy()
     np.testing.assert_allclose(timed, homogeneous(corrected).numpy() @ on_rig, atol=1e-9)
     # As the evaluation places it: renderings from there are compared with the image.
     cameras = run.read_reference_views("test").cameras

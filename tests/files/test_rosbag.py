@@ -102,9 +102,8 @@ def test_a_damaged_time_moves_no_later_packet(
             for i, words in enumerate(packets)
         ]
         # The sixth is lost.
-        return read(
-            open_event_file(write_bag(folder / "times.bag", {"/events": (PACKET, messages[:5] + messages[6:])}))
-        )
+        bag = write_bag(folder / "times.bag", {"/events": (PACKET, messages[:5] + messages[6:])})
+        return read(open_event_file(bag))
 
     packets = [packet_words(number) for number in range(12)]
     expected = events_of(packets)

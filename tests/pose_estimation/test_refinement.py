@@ -220,7 +220,6 @@ def test_poses_far_from_images_keep_the_given_motion(truth: np.ndarray) -> None:
 def test_poses_that_tracks_contradict_are_refused() -> None:
     turned = np.array([0.0, 0.0, 0.5, 0.1, 0.0, 0.0])
     require_near_mount(SharedError(0.01, turned, 1.0), 2.5, "scene")
-    with pytest.raises(
-        DataError, match=r"scene: .* moved by 2 of their units .* the scene is 2.5 away; .*--poses events"
-    ):
+    message = r"scene: .* moved by 2 of their units .* the scene is 2.5 away; .*--poses events"
+    with pytest.raises(DataError, match=message):
         require_near_mount(SharedError(0.01, 4 * turned, 1.0), 2.5, "scene")

@@ -36,18 +36,16 @@ def test_all_splits_share_the_reported_world(tmp_path: Path) -> None:
     original = train.transform_poses_to_original_space(test.cameras.camera_to_worlds, "opencv")
     torch.testing.assert_close(original, make_trajectory().camera_to_worlds[[4, 5]].float(), rtol=0, atol=1e-5)
     # The framework's convention: cameras fit in a box of +/- 1 about the origin.
-    assert train.metadata[SCENE_KEY].trajectory.camera_to_worlds[:, :, 3].abs().max().item() == pytest.approx(
-        1.0, rel=1e-2
-    )
+    positions = train.metadata[SCENE_KEY].trajectory.camera_to_worlds[:, :, 3]
+    assert positions.abs().max().item() == pytest.approx(1.0, rel=1e-2)
 
 
 def test_a_world_far_from_its_origin_is_the_same_scene(tmp_path: Path) -> None:
     near, far = write_native(tmp_path / "near"), write_native(tmp_path / "far")
     offset = torch.tensor([4e5, 5e6, 100.0], dtype=torch.float64)
     path = far / "trajectory_estimated.txt"
-    write_tum_trajectory(
-        path, read_tum_trajectory(path).transform(lambda poses: poses + F.pad(offset[:, None], (3, 0, 0, 1)))
-    )
+    moved = read_tum_trajectory(path).transform(lambda poses: poses + F.pad(offset[:, None], (3, 0, 0, 1)))
+    write_tum_trajectory(path, moved)
     first, second = (parse(NativeDataParserConfig(data=data)).metadata[SCENE_KEY] for data in (near, far))
     assert second.scale == pytest.approx(first.scale, rel=1e-6)
     poses = [scene.trajectory.camera_to_worlds for scene in (first, second)]
@@ -107,9 +105,8 @@ def test_refuse_reference_views_far_away(tmp_path: Path) -> None:
         set_in("transforms.json", "frames", index, "transform_matrix", 0, 3, value=4e5)(folder)
     config = NativeDataParserConfig(data=folder)
     assert len(parse(config, "train").image_filenames)
-    with pytest.raises(
-        DataError, match=r"ground_truth.txt: a reference view is .* times as far .*; subtract one offset"
-    ):
+    message = r"ground_truth.txt: a reference view is .* times as far .*; subtract one offset"
+    with pytest.raises(DataError, match=message):
         parse(config, "test")
 
 

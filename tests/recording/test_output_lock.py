@@ -69,9 +69,8 @@ def test_file_system_without_locks_is_used(
 
     monkeypatch.setattr(FileLock, "acquire", none)
     write_native(tmp_path / "[made]")
-    assert (
-        "[made]: its file system has no locks (No locks available): start no second command" in capsys.readouterr().out
-    )
+    warning = "[made]: its file system has no locks (No locks available): start no second command"
+    assert warning in capsys.readouterr().out
     assert list(tmp_path.iterdir()) == [tmp_path / "[made]"]
 
 

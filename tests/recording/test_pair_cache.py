@@ -107,9 +107,8 @@ def test_changed_events_or_options_make_new_pairs(
     whole = len(opened(data).pairs)
     start = opened(data).scene.window.start + 500_000_000
     assert len(opened(data, start_time_ns=start).pairs) < whole
-    assert "events.h5.pairs is of other events or options: it is made again." in " ".join(
-        capsys.readouterr().out.split()
-    )
+    printed = " ".join(capsys.readouterr().out.split())
+    assert "events.h5.pairs is of other events or options: it is made again." in printed
     assert len(long_recording) == 2
     assert len(opened(data, start_time_ns=start).pairs) < whole
     assert len(long_recording) == 2

@@ -31,9 +31,8 @@ def test_frame_displacement() -> None:
     assert frame_displacement(depth, np.eye(4), behind, intrinsics) == np.inf
     nothing = np.full((24, 32), np.inf)
     assert frame_displacement(nothing, np.eye(4), shifted, intrinsics) == 0
-    assert frame_displacement(nothing, np.eye(4), shifted @ rolled, intrinsics, sees_infinity=True) == pytest.approx(
-        expected, abs=1e-12
-    )
+    found = frame_displacement(nothing, np.eye(4), shifted @ rolled, intrinsics, sees_infinity=True)
+    assert found == pytest.approx(expected, abs=1e-12)
 
 
 def test_frame_parameters_bound_the_motion(box_file: Path) -> None:

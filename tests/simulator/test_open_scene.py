@@ -133,9 +133,8 @@ def test_materials_get_coats(box_file: Path) -> None:
     assert after.max() == pytest.approx(1, abs=1e-4)
     assert before.max() < 0.95
     # Exposure scales lamps and sky alike. The sky's uppermost texel is a little darker than its zenith.
-    assert shiny.renderer.reflections.lamps[0, 3] == pytest.approx(
-        9 * shiny.renderer.reflections.environment.texels.max(), rel=2e-3
-    )
+    reflections = shiny.renderer.reflections
+    assert reflections.lamps[0, 3] == pytest.approx(9 * reflections.environment.texels.max(), rel=2e-3)
 
 
 def test_bare_mesh_is_in_view(tmp_path: Path) -> None:
@@ -151,9 +150,8 @@ def test_bare_mesh_is_in_view(tmp_path: Path) -> None:
         hit = np.isfinite(depth)
         assert 0.02 < hit.mean() < 0.6
         brightest = max(brightest, radiance[hit].max())
-        points = (
-            ray_directions(scene.intrinsics(60, 45), 60, 45)[hit] * depth[hit][:, None] @ pose[:3, :3].T + pose[:3, 3]
-        )
+        directions = ray_directions(scene.intrinsics(60, 45), 60, 45)[hit]
+        points = directions * depth[hit][:, None] @ pose[:3, :3].T + pose[:3, 3]
         assert (points > scene.aabb[0]).all()
         assert (points < scene.aabb[1]).all()
     assert 0.8 < brightest < 1

@@ -178,6 +178,5 @@ WEAK = {"start_seconds": 1.2, "end_seconds": 1.6, "loss": 0.5, "loss_of_constant
 def test_summary_names_each_sign(change: dict[str, Any], sign: str | None) -> None:
     line = summarize({**GOOD, **change})
     assert (f"Signs of failure: {sign}" if sign else "No sign of failure.") in line
-    assert ("contrast of warped events 0.500 before, 0.520 after" in line) == (
-        change.get("contrast_corrected", 1) is not None
-    )
+    has_contrast = change.get("contrast_corrected", 1) is not None
+    assert ("contrast of warped events 0.500 before, 0.520 after" in line) == has_contrast
