@@ -117,12 +117,8 @@ def _read_calibration(path: Path) -> tuple[CameraIntrinsics, SensorModel]:
             stated.distortion_params,
             stated.distortion_model,
         )
-        sensor = SensorModel(
-            stated.pos_contrast_threshold,
-            stated.neg_contrast_threshold,
-            round(stated.refractory_period),
-            stated.bayer_pattern,
-        )
+        thresholds = stated.pos_contrast_threshold, stated.neg_contrast_threshold
+        sensor = SensorModel(*thresholds, round(stated.refractory_period), stated.bayer_pattern)
     return camera, sensor
 
 

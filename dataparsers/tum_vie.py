@@ -119,17 +119,10 @@ class TumVieDataParser(EventDataParser):
         reference = read_tum_trajectory(mocap, "us").transform(lambda poses: poses @ marker_from_event)
         image_folder = mocap.parent / f"{side}_images"
         images = read_image_times(image_folder, image_folder / f"image_timestamps_{side}.txt", "us")
-        return self.config.make_recording(
-            reference,
-            capture,
-            max_pose_gap=_MAX_MOCAP_GAP if self.config.trajectory is None else None,
-            reference_views=views_on_trajectory(
-                images,
-                reference,
-                torch.linalg.inv(imu_from_event) @ imu_from_frame,
-                max_pose_gap=self.config.max_pose_gap_ns or _MAX_MOCAP_GAP,
-            ),
-        )
+        longest = self.config.max_pose_gap_ns or _MAX_MOCAP_GAP
+        views = views_on_trajectory(images, reference, torch.linalg.inv(imu_from_event) @ imu_from_frame, longest)
+        max_pose_gap = _MAX_MOCAP_GAP if self.config.trajectory is None else None
+        return self.config.make_recording(reference, capture, max_pose_gap=max_pose_gap, reference_views=views)
 
     def poses_path(self) -> Path:
         events, sequence, _ = _choose(self.data)

@@ -92,15 +92,10 @@ def _with_options(
         if not equals or key.replace("-", "_") not in known:
             remedy = f"write KEY=VALUE with one of {', '.join(known)}"
             raise DataError(f"--format-options {option}", f"not an option of {name}", remedy)
+        # As ns-train parses it.
+        words, markers = [f"--{key}={value}"], (tyro.conf.FlagConversionOff,)
         try:
-            # As ns-train parses it.
-            config = tyro.cli(
-                type(config),
-                default=config,
-                args=[f"--{key}={value}"],
-                config=(tyro.conf.FlagConversionOff,),
-                console_outputs=False,
-            )
+            config = tyro.cli(type(config), default=config, args=words, config=markers, console_outputs=False)
         except SystemExit:
             remedy = f"see {name} in docs/options.md for what {key} may be"
             raise DataError(f"--format-options {option}", f"{value!r} is not a value of {key}", remedy) from None

@@ -47,12 +47,9 @@ def main() -> None:
         # Imported here, so that Ctrl-C while it is imported is one line, too.
         import tyro
 
-        command = tyro.extras.subcommand_cli_from_dict(
-            {name: load_command(name) for name in names},
-            prog="aenerf",
-            description="AE-NeRF tools; train with ns-train aenerf.",
-            args=words,
-        )
+        commands = {name: load_command(name) for name in names}
+        description = "AE-NeRF tools; train with ns-train aenerf."
+        command = tyro.extras.subcommand_cli_from_dict(commands, prog="aenerf", description=description, args=words)
         command.main()
     except DataError as error:
         print(f"Error: {error}", file=sys.stderr)

@@ -177,13 +177,9 @@ class SimulateVideo(SimulationCommand):
             "val": spread_evenly(taken[::2], self.validation_views),
             "test": spread_evenly(taken[1::2], self.test_views),
         }
+        sensor = simulator.sensor
         with NativeDatasetWriter(
-            lock,
-            poses.camera,
-            simulator.sensor,
-            "srgb",
-            poses.scene_box,
-            has_estimated_intrinsics=poses.has_estimated_lens,
+            lock, poses.camera, sensor, "srgb", poses.scene_box, has_estimated_intrinsics=poses.has_estimated_lens
         ) as writer:
             writer.add_trajectories(poses.estimated, poses.truth)
             if poses.report is not None:

@@ -247,19 +247,9 @@ class Hdf5EventWriter:
         group = self._file.create_group("events")
         group.attrs["time_unit"] = "ns"
         group.attrs["time_offset"] = 0
-        return {
-            name: group.create_dataset(
-                name,
-                shape=(0,),
-                maxshape=(None,),
-                dtype=dtype,
-                chunks=(1 << 16,),
-                compression="gzip",
-                compression_opts=1,
-                shuffle=True,
-            )
-            for name, dtype in _DTYPES.items()
-        }
+        layout: dict[str, Any] = {"shape": (0,), "maxshape": (None,), "chunks": (1 << 16,), "shuffle": True}
+        layout |= {"compression": "gzip", "compression_opts": 1}
+        return {name: group.create_dataset(name, dtype=dtype, **layout) for name, dtype in _DTYPES.items()}
 
     def __enter__(self) -> Hdf5EventWriter:
         return self

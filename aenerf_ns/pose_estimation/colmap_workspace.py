@@ -8,6 +8,7 @@ import shutil
 import statistics
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
+from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 from tempfile import TemporaryDirectory, mkdtemp
@@ -265,13 +266,9 @@ class ColmapWorkspace:
             options.multiple_models, begun = False, self._new_folder()
             start.write(begun)
         with self._step("Placing frames", len(self._names)) as task:
+            advance = partial(self._progress.advance, task)
             models = pycolmap.incremental_mapping(
-                self._database,
-                self._images,
-                output,
-                options,
-                begun or "",
-                next_image_callback=lambda: self._progress.advance(task),
+                self._database, self._images, output, options, begun or "", next_image_callback=advance
             )
         return _largest_first(models)
 

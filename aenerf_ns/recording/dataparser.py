@@ -182,6 +182,21 @@ class EventDataParser(DataParser):
             frames = ()
         # Nerfstudio wants a file name for every camera, also for one without an image.
         names = [images.get(index, self.data / f"camera_{index:05d}") for index in range(len(cameras))]
+        scene = SceneRecording(
+            frame=frame,
+            trajectory=trajectory,
+            ground_truth=ground_truth,
+            event_camera=recording.event_camera,
+            event_file=recording.event_file,
+            sensor=recording.sensor,
+            window=window,
+            camera_times=times,
+            has_image=[index in images for index in range(len(cameras))],
+            image_encoding=recording.image_encoding,
+            bounded=recording.scene_box is not None,
+            frames=frames,
+            is_whole=self.config.start_time_ns is None and self.config.end_time_ns is None,
+        )
         return DataparserOutputs(
             image_filenames=names,
             cameras=cameras,
@@ -189,23 +204,7 @@ class EventDataParser(DataParser):
             dataparser_transform=transform.float(),
             dataparser_scale=scale,
             alpha_color=None if recording.image_background is None else torch.tensor(recording.image_background),
-            metadata={
-                SCENE_KEY: SceneRecording(
-                    frame=frame,
-                    trajectory=trajectory,
-                    ground_truth=ground_truth,
-                    event_camera=recording.event_camera,
-                    event_file=recording.event_file,
-                    sensor=recording.sensor,
-                    window=window,
-                    camera_times=times,
-                    has_image=[index in images for index in range(len(cameras))],
-                    image_encoding=recording.image_encoding,
-                    bounded=recording.scene_box is not None,
-                    frames=frames,
-                    is_whole=self.config.start_time_ns is None and self.config.end_time_ns is None,
-                )
-            },
+            metadata={SCENE_KEY: scene},
         )
 
     @cached_property

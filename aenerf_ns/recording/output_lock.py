@@ -61,13 +61,9 @@ class OutputLock:
         except OSError as error:
             if error.errno not in _NO_LOCKS:
                 raise
-            CONSOLE.print(
-                f"{self.output}: its file system has no locks ({error.strerror}): start no second command "
-                "with this output",
-                style="yellow",
-                markup=False,
-                soft_wrap=True,
-            )
+            problem = f"its file system has no locks ({error.strerror})"
+            warning = f"{self.output}: {problem}: start no second command with this output"
+            CONSOLE.print(warning, style="yellow", markup=False, soft_wrap=True)
 
     def release(self) -> None:
         """Let others write the output."""

@@ -91,12 +91,9 @@ class PairFile:
             self._is_kept = True
         except OSError as error:
             folder = Path(tempfile.gettempdir())
-            CONSOLE.print(
-                f"{self.path.parent} cannot be written to ({error.strerror}): the pairs are in {folder} until "
-                "this process ends, and are made again by the next.",
-                style="yellow",
-                markup=False,
-            )
+            problem = f"{self.path.parent} cannot be written to ({error.strerror})"
+            warning = f"{problem}: the pairs are in {folder} until this process ends, and are made again by the next."
+            CONSOLE.print(warning, style="yellow", markup=False)
             # The file has no name, and is gone when the process ends.
             self._new = tempfile.TemporaryFile(dir=folder)  # noqa: SIM115
         return self._new, folder

@@ -81,14 +81,9 @@ def paired_differences(reports: Sequence[RunReport], shared: Sequence[str]) -> l
     for other in others:
         theirs = {view["file"]: view for view in other.views}
         for protocol in ("placed", "refined"):
+            pairs = [(ours[file].get(protocol, {}), theirs[file].get(protocol, {})) for file in shared]
             for metric in IMAGE_METRICS:
-                differences = np.array(
-                    [
-                        theirs[file][protocol][metric] - ours[file][protocol][metric]
-                        for file in shared
-                        if all(metric in views[file].get(protocol, {}) for views in (ours, theirs))
-                    ]
-                )
+                differences = np.array([b[metric] - a[metric] for a, b in pairs if metric in a and metric in b])
                 if len(differences):
                     mean, count = float(differences.mean()), len(differences)
                     half = float(stats.t.ppf(0.975, count - 1) * stats.sem(differences)) if count > 1 else None
