@@ -66,12 +66,12 @@ class Page:
         assert "exceptionDetails" not in result, result
         return result["result"].get("value")
 
-    def open_file(self, path: Path, width: int = 1280, height: int = 900) -> None:
+    def open_file(self, path: Path) -> None:
         """Opens a file with the network off."""
         for domain in ("Page", "Runtime", "Log", "Network"):
             self.send(f"{domain}.enable")
         self.send("Network.emulateNetworkConditions", offline=True, latency=0, downloadThroughput=0, uploadThroughput=0)
-        self.open(path.resolve().as_uri(), width, height)
+        self.open(path.resolve().as_uri())
 
     def open(self, address: str, width: int = 1280, height: int = 900) -> None:
         self.send("Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1, mobile=False)

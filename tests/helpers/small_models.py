@@ -173,8 +173,8 @@ def make_rays(count: int = 10, away: bool = False, with_times: bool = False) -> 
     )
 
 
-def make_batch(num_pairs: int, device: torch.device | str = "cpu") -> PairBatch:
-    positive = (torch.arange(num_pairs, device=device) % 2).float()
+def make_batch(num_pairs: int) -> PairBatch:
+    positive = (torch.arange(num_pairs) % 2).float()
     zeros = torch.zeros_like(positive).long()
     return PairBatch(
         num_positive=positive,
