@@ -198,6 +198,8 @@ class TextEventFile(EventFile):
 
     def read_chunks(self) -> Iterator[EventStream]:
         tick = NANOSECONDS[self._unit_of(self._ends())]
+        # The ends may have counted a line that is counted again.
+        self.left_out.restart()
         with self.path.open("rb") as file:
             for lines in self._lines(file, self._names(file)):
                 yield self._events(lines, tick)
@@ -220,9 +222,9 @@ class TextEventFile(EventFile):
             file.seek(begin)
             # A line that begins ahead of this piece of the file is looked at with the piece before.
             begin += len(self._line(file)) if begin > 0 else 0
-            lines = file.read(end - begin).removeprefix(_BYTE_ORDER_MARK).splitlines()
+            lines = file.read(end - begin).removeprefix(_BYTE_ORDER_MARK).splitlines(keepends=True)
             row, end = next((line for line in reversed(lines) if _is_row(line)), b""), begin
-        return self._parse_block(row + b"\n", None, names)
+        return self._parse_block(row, None, names)
 
     def _lines(self, file: BinaryIO, names: list[str]) -> Iterator[_Lines]:
         """Parse a file after its header, in pieces of at least one event."""
@@ -231,7 +233,6 @@ class TextEventFile(EventFile):
         num_before = file.read(header_end).count(b"\n")
         while text := file.read(BLOCK):
             text += self._line(file)
-            text += b"" if text.endswith(b"\n") else b"\n"
             lines = self._parse_block(text, num_before, names)
             if lines.whole.shape[1]:
                 yield lines
@@ -248,10 +249,17 @@ class TextEventFile(EventFile):
     def _parse_block(self, text: bytes, num_before: int | None, names: list[str]) -> _Lines:
         # A name that comes twice means its first column.
         slots = [_COLUMNS.find(name) if names.index(name) == i else -1 for i, name in enumerate(names)]
+        is_whole = text.endswith(b"\n")
+        text += b"" if is_whole else b"\n"
         whole, fraction, fault = parse_lines(text, self._with_commas, slots)
         if fault is not None:
-            line = _line_name(text.count(b"\n", 0, fault), num_before)
-            raise self._malformed(line, text[fault : text.index(b"\n", fault)], names)
+            end = text.index(b"\n", fault)
+            # An interrupted recording ends within a line. One line alone tells of another format.
+            if not is_whole and end == len(text) - 1 and (fault > 0 or num_before != 0):
+                self._leave_out_end("a line", self.path.stat().st_size - (end - fault))
+            else:
+                line = _line_name(text.count(b"\n", 0, fault), num_before)
+                raise self._malformed(line, text[fault:end], names)
         return _Lines(text, num_before, whole, fraction)
 
     def _fields(self, line: bytes) -> list[bytes]:

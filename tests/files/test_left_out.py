@@ -86,14 +86,17 @@ def test_leave_out_a_few_malformed_events(suffix: str, folder: Path, capsys: pyt
     assert f"y = {HEIGHT + 3}" in said or "impossible y (the first " in said
 
 
-@pytest.mark.parametrize("suffix", [".dat", ".aedat4", ".evt2.raw", ".evt3.raw"])
+@pytest.mark.parametrize("suffix", [".dat", ".aedat4", ".evt2.raw", ".evt3.raw", ".txt", ".csv"])
 def test_leave_out_the_end_of_an_interrupted_recording(
     suffix: str, folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = folder / f"cut{suffix}"
     WRITERS[suffix](path, ROWS)
     # A packet of AEDAT4 without events is the last one.
-    path.write_bytes(path.read_bytes()[: -20 if suffix == ".aedat4" else -1])
+    path.write_bytes(path.read_bytes()[: {".aedat4": -20, ".txt": -3, ".csv": -3}.get(suffix, -1)])
+    if suffix in (".txt", ".csv"):
+        with pytest.raises(DataError, match=r"ends within a line at byte .*--drop-malformed"):
+            opened(path).time_span()
     file = opened(path)
     file.drop_malformed = True
     times = read(file)[:, 2].tolist()
