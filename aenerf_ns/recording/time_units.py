@@ -42,13 +42,16 @@ def require_one_unit(events: EventFile, poses: Trajectory, option: str) -> Span:
     # The time of one damaged event, at an end, says nothing of the unit.
     if power is None or (power < 0 and _share_within(events, known) >= _MIN_COVERED):
         return span
+    # A short part at the beginning looks like that, too.
+    is_part = power > 0 and covered >= _MIN_COVERED * (span[1] - span[0])
+    part = ", or, if this part is what you want, give its --start-time-ns and --end-time-ns" if is_part else ""
     problem = f"the poses last {poses.duration:g} s and the events {seconds:g} s, as if the times of "
     source = poses.source if power > 0 else events.path
     if not option:
         event_error, pose_error = ("small", "large") if power > 0 else ("large", "small")
         problem += f"the events were {1000 ** abs(power):,} times too {event_error}, "
         problem += f"or those of the poses too {pose_error}"
-        raise DataError(source, problem, "correct the unit of either")
+        raise DataError(source, problem, "correct the unit of either" + part)
     blamed, remedies = [], []
     assumed = events.assumed_unit()
     is_short, is_long = seconds < _SHORTEST, poses.duration > _LONGEST
@@ -62,7 +65,7 @@ def require_one_unit(events: EventFile, poses: Trajectory, option: str) -> Span:
         remedies.append("write the times of the poses in seconds")
     if not blamed:
         return span
-    raise DataError(source, problem + ", or those of ".join(blamed), ", or ".join(remedies))
+    raise DataError(source, problem + ", or those of ".join(blamed), ", or ".join(remedies) + part)
 
 
 def require_covered(source: Path, num_events: int, num_covered: int) -> None:
