@@ -124,7 +124,8 @@ class Convert(DatasetCommand):
         report = picture = None
         if has_given_poses:
             recording = parser.recording
-            parser.event_span(recording)
+            if self.start_time_ns is None or self.end_time_ns is None:
+                parser.event_span(recording)
             if self.poses == "refined":
                 recording, report, picture = self._with_refined_poses(parser, recording, filters.window)
         else:

@@ -160,6 +160,8 @@ def test_a_short_part_that_looks_like_another_unit_is_read_when_it_is_named(reco
     with pytest.raises(DataError, match="if this part is what you want, give its --start-time-ns and --end-time-ns"):
         window_of(recording)
     assert window_of(recording, start_time_ns=0, end_time_ns=10**8) == pytest.approx((0, 0.1))
+    words = [str(recording), "--output", str(recording / "made"), "--start-time-ns", "0", "--end-time-ns", "100000000"]
+    tyro.cli(Convert, args=words).main()
 
 
 def test_refuse_events_of_which_hardly_any_has_a_pose(recording: Path, tmp_path: Path) -> None:
