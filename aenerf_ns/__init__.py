@@ -12,8 +12,9 @@ from contextlib import suppress
 
 __version__ = "0.2.0"
 
-# It says nothing that a user could change.
+# They say nothing that a user could change. The second is of Nerfstudio's cameras, under recent versions of torch.
 warnings.filterwarnings("ignore", r"`torch\.(jit\.script|cuda\.amp)", FutureWarning)
+warnings.filterwarnings("ignore", "Using a non-tuple sequence", UserWarning)
 
 
 def _is_writable(folder: str) -> bool:
