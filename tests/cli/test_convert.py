@@ -298,7 +298,7 @@ def test_frames_of_another_camera_give_no_poses(tmp_path: Path) -> None:
         ({"poses": "events", "region": (0, 0, 7, 4)}, "region of interest 0 0 7 4 .* beyond its 6 x 4 pixels"),
         ({"poses": "refined", "region": (1, 0, 4, 4)}, "from pixel 1 0 of a color sensor; begin it at an even"),
         ({"poses": "colmap", "end_time_ns": START + 1}, "1 frames; poses can be estimated from three"),
-        ({"poses": "events", "seed": 2**31}, "--seed: 2147483648 is out of range"),
+        ({"poses": "events", "seed": 2**32}, "--seed: 4294967296 is out of range"),
     ],
 )
 def test_impossible_options_are_one_line(options: dict, message: str, tmp_path: Path) -> None:
