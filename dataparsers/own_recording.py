@@ -59,8 +59,8 @@ class OwnRecordingDataParserConfig(PublishedDataParserConfig):
     frame_camera: str | None = None
     """Name in a camchain of several cameras of the one that took the images, which may be the event camera."""
     poses: Path | None = None
-    """Poses of the event camera as t tx ty tz qx qy qz qw in seconds, camera-to-world, OpenCV camera axes. By default
-    trajectory.txt in the folder."""
+    """Poses of the event camera as t tx ty tz qx qy qz qw in seconds, camera-to-world, OpenCV camera axes, or
+    the folder of a COLMAP model. By default trajectory.txt in the folder."""
     colmap: Path | None = None
     """Folder of a COLMAP model, in place of the poses. images.txt must list the images of the model with their times.
     By default "colmap" in the folder, where there is no trajectory.txt."""
@@ -107,7 +107,7 @@ class OwnRecordingDataParser(EventDataParser):
         stated = config.colmap or config.poses
         if stated is not None and not stated.exists():
             option = "--colmap" if config.colmap else "--poses"
-            raise DataError(stated, "there is no such file of poses", f"correct {option}, or leave it out")
+            raise DataError(stated, "there are no poses", f"correct {option}, or leave it out")
         trajectory, model = self._folder / "trajectory.txt", self._folder / "colmap"
         return stated or (model if model.is_dir() and not trajectory.is_file() else trajectory)
 

@@ -46,8 +46,8 @@ class DatasetCommand:
     format_options: Annotated[tuple[str, ...], tyro.conf.arg(metavar="KEY=VALUE ...")] = field(default=(), kw_only=True)
     """Options of the format (docs/options.md), such as width=346 height=260."""
     drop_malformed: bool = field(default=False, kw_only=True)
-    """Leave out events outside the sensor or out of order, as long as they are at most a thousandth, and say how many
-    and where."""
+    """Leave out events outside the sensor or out of order, as long as they are at most a thousandth, and the piece in
+    which an interrupted file ends. Say how many and where."""
 
     placing_options: ClassVar[tuple[str, ...]] = ()
     """Options of all formats that the command takes, too: they place the recording in a scene, or cut it."""

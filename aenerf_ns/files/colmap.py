@@ -148,7 +148,7 @@ def _read_text(path: Path, file: BinaryIO) -> Iterator[Row]:
                 yield fields[9], values, int(camera)
             except (ValueError, IndexError, OverflowError):
                 raise _damaged(path, f"line {number} is not an image: {line[:40]!r}") from None
-        elif len(line.split()) % 3:
+        elif (words := line.split()) and (len(words) % 3 or not words[-1].lstrip(b"-").isdigit()):
             remedy = "write the features of an image, or an empty line, below its pose"
             raise DataError(path, f"line {number} holds no features x y POINT3D_ID: {line[:40]!r}", remedy)
         is_pose = not is_pose

@@ -71,8 +71,7 @@ class EventFile(ABC):
         return None
 
     def read_assumed_unit(self) -> TimeUnit | None:
-        """Return the unit of the times that is assumed or that the user states, or None where the file or its format
-        states it."""
+        """Return the unit of the times that the user gives or the format assumes, or None where the file states it."""
         return None
 
     def time_span(self) -> tuple[int, int]:

@@ -198,7 +198,7 @@ class TextEventFile(EventFile):
 
     def read_chunks(self) -> Iterator[EventStream]:
         tick = NANOSECONDS[self._unit_of(self._ends())]
-        # The ends may have counted a line that is counted again.
+        # The ends may already have counted the line that the file ends within.
         self.left_out.restart()
         with self.path.open("rb") as file:
             for lines in self._lines(file, self._names(file)):
@@ -254,7 +254,7 @@ class TextEventFile(EventFile):
         whole, fraction, fault = parse_lines(text, self._with_commas, slots)
         if fault is not None:
             end = text.index(b"\n", fault)
-            # An interrupted recording ends within a line. One line alone tells of another format.
+            # An interrupted recording ends within a line. One line alone, without a header, tells of another format.
             if not is_whole and end == len(text) - 1 and (fault > 0 or num_before != 0):
                 self._leave_out_end("a line", self.path.stat().st_size - (end - fault))
             else:

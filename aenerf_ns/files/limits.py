@@ -140,13 +140,17 @@ def require_unpacked_size(path: Path, name: str, unpacked: int, packed: int) -> 
 
 
 def visible_files(folder: Path, pattern: str) -> list[Path]:
-    """List the files and folders in a folder that match a pattern, in the order of their names: 2 is ahead of 10.
+    """List the files and folders in a folder that match a pattern, in the order of their names.
+
+    Numbers in the names count as such: 2 is ahead of 10, and 0.15 ahead of 0.2.
 
     Hidden ones do not count: macOS puts one beside each file that it copies to other disks.
     """
 
-    def order(file: Path) -> list[str | int]:
-        return [int(part) if part.isdecimal() else part for part in re.split(r"(\d+)", file.name)]
+    def order(file: Path) -> tuple[list[str | float], str]:
+        parts = re.split(r"(\d+(?:\.\d+)?)", file.name)
+        # Numbers of many digits may be equal as decimals.
+        return [float(part) if index % 2 else part for index, part in enumerate(parts)], file.name
 
     return sorted((file for file in folder.glob(pattern) if not file.name.startswith(".")), key=order)
 

@@ -19,7 +19,7 @@ from aenerf_ns.files.json_file import Nanoseconds, convert, read_json
 
 _MOUNT = "T_frame_event"
 # What other programs call the distortion and its model.
-_UNREAD_LENS = "dist(_|$)|.*distort|.*fisheye|lens_model"
+_UNREAD_LENS = "dist(_|$)|(?!.*undistort).*distort|(is_)?fisheye$|lens_model"
 # Names of parts of a lens, also other programs'.
 _LENS = {"camera_model", "k1", "k2", "k3", "k4", "p1", "p2", "fl_x", "fx", "K", "camera_matrix", "intrinsics"}
 Vector = tuple[float, float, float]
@@ -122,9 +122,11 @@ def read_transforms(path: Path, image_encoding: ImageEncoding = "srgb") -> tuple
     values = {"image_encoding": image_encoding, **read_json(path, dict)}
     camera = values.get("event_camera")
     parts = [part for part in (values, camera) if isinstance(part, dict)]
-    for name in (name for part in parts for name, value in part.items() if value and re.match(_UNREAD_LENS, name)):
-        remedy = "state camera_model, and k1, k2, p1, p2, k3 or for a fisheye (OPENCV_FISHEYE) k1 to k4"
-        raise DataError(path, f"it states {name}, which is not read", remedy)
+    for part in parts:
+        known = {"is_fisheye"} if part.get("camera_model") == "OPENCV_FISHEYE" else set()
+        if unread := [name for name in part if name not in known and part[name] and re.match(_UNREAD_LENS, name)]:
+            remedy = "state camera_model, and k1, k2, p1, p2, k3 or for a fisheye (OPENCV_FISHEYE) k1 to k4"
+            raise DataError(path, f"it states {unread[0]}, which is not read", remedy)
     stated = [name for part in parts for name in part if re.match("T_.*event", name) and name != _MOUNT]
     if stated and not (isinstance(camera, dict) and camera.get(_MOUNT) is not None):
         remedy = f"state {_MOUNT} in event_camera, which takes points from its coordinates to the frame camera's"

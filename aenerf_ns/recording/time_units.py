@@ -44,7 +44,11 @@ def require_one_unit(events: EventFile, poses: Trajectory, option: str) -> Span:
         return span
     # A short part at the beginning looks like that, too.
     is_part = power > 0 and covered >= _MIN_COVERED * (span[1] - span[0])
-    part = ", or, if this part is what you want, give its --start-time-ns and --end-time-ns" if is_part else ""
+    part = (
+        ", or, if this part is what you want, give its start-time-ns and end-time-ns as options of the format"
+        if is_part
+        else ""
+    )
     problem = f"the poses last {poses.duration:g} s and the events {seconds:g} s, as if the times of "
     source = poses.source if power > 0 else events.path
     if not option:

@@ -85,8 +85,10 @@ class Runner:
         made = json.loads(evaluation.read_text("utf8"))
         evaluation.unlink()
         if math.isnan(made["results"]["psnr"]):
-            # aenerf-ns says so itself. Nerfstudio's own methods go on.
-            raise DataError(evaluation.parent, "the pictures are not numbers", "use another seed, or leave the run out")
+            # Nerfstudio's own methods train on after their weights are NaN. Those of aenerf-ns stop with an error.
+            raise DataError(
+                evaluation.parent, "the rendered pictures are NaN", "use another seed, or leave the run out"
+            )
         (config,) = (self._folder / "outputs" / run.name).rglob("config.yml")
         figures = {
             "table": run.table,

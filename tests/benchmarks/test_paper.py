@@ -171,7 +171,7 @@ def test_a_run_that_renders_no_numbers_failed(tmp_path: Path, monkeypatch: pytes
     monkeypatch.setattr(Runner, "_dataset", lambda *_: tmp_path)
     monkeypatch.setattr(Runner, "_train", train)
     runner = Runner(tmp_path, "cpu")
-    assert "are not numbers" in make_all(runner, [run])[run.name]
+    assert "pictures are NaN" in make_all(runner, [run])[run.name]
     assert runner.figures(run) is None
 
 

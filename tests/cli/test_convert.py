@@ -93,6 +93,8 @@ def test_frame_camera_and_images_are_carried_over(tmp_path: Path) -> None:
     data = write_native(tmp_path / "made")
     meta = json.loads((data / "transforms.json").read_text())
     meta.update(w=8, h=5, fl_x=9.0, fl_y=9.5, cx=4.1, cy=2.4, camera_model="OPENCV_FISHEYE", k1=0.1, k4=-0.2)
+    # Other programs' names that say nothing else.
+    meta.update(is_fisheye=True, fisheye_crop_radius=3, undistorted=True)
     for key in ("k2", "k3", "p1", "p2"):
         meta.pop(key)
     for index, frame in enumerate(meta["frames"]):

@@ -71,6 +71,8 @@ def test_hidden_files_are_no_data(tmp_path: Path) -> None:
 
 
 def test_files_are_in_the_order_of_their_numbers(tmp_path: Path) -> None:
-    for name in ("r_10.png", "r_9.png", "r_100.png"):
+    stamps = ["t1700000000000000001.png", "t1700000000000000002.png"]
+    names = ["0.15.png", "0.2.png", "r_9.png", "r_10.png", "r_100.png", *stamps]
+    for name in reversed(names):
         (tmp_path / name).touch()
-    assert [file.name for file in list_files(tmp_path, "*.png")] == ["r_9.png", "r_10.png", "r_100.png"]
+    assert [file.name for file in list_files(tmp_path, "*.png")] == names

@@ -157,7 +157,7 @@ def test_parts_of_right_recordings_are_read(start: float, events: float, poses: 
 def test_a_short_part_that_looks_like_another_unit_is_read_when_it_is_named(recording: Path) -> None:
     write_npz(recording, scaled(random_events(0.1), 1e6))
     write_poses(recording / "trajectory.txt", 10, 50)
-    with pytest.raises(DataError, match="if this part is what you want, give its --start-time-ns and --end-time-ns"):
+    with pytest.raises(DataError, match="if this part is what you want, give its start-time-ns and end-time-ns"):
         window_of(recording)
     assert window_of(recording, start_time_ns=0, end_time_ns=10**8) == pytest.approx((0, 0.1))
     words = [str(recording), "--output", str(recording / "made"), "--start-time-ns", "0", "--end-time-ns", "100000000"]
