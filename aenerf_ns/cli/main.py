@@ -47,7 +47,7 @@ def main() -> None:
         # Imported here, so that Ctrl-C while it is imported is one line, too.
         import tyro
 
-        commands = {name: load_command(name) for name in names}
+        commands: dict[str, Any] = {name: load_command(name) for name in names}
         description = "AE-NeRF tools; train with ns-train aenerf."
         command = tyro.extras.subcommand_cli_from_dict(commands, prog="aenerf", description=description, args=words)
         command.main()
