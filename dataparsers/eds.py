@@ -52,7 +52,7 @@ class EdsDataParserConfig(PublishedDataParserConfig):
 
     @classmethod
     def recognizes(cls, data: Path) -> bool:
-        # Other programs give poses this name, too. Where a lens is stated, the authors' is another one.
+        # Other programs write poses under this name, too. A folder that states a lens is of another camera.
         return super().recognizes(data) and not any((data / name).exists() for name in CALIBRATIONS)
 
 

@@ -28,7 +28,7 @@ from aenerf_ns.recording.recording import Capture, Recording
 from aenerf_ns.recording.views import IMAGE_LIST, read_image_list, require_distinct_times, views_on_trajectory
 
 CALIBRATIONS = ("calibration.json", "camchain.yaml", "camera_info.yaml")
-"""The files in a folder of which one is the calibration."""
+"""A recording's folder holds its calibration in one of these files."""
 # COLMAP's own estimate may be off by some percent.
 _MAX_FOCAL_RATIO = 1.15
 

@@ -46,7 +46,7 @@ def peer(
     config.pipeline.datamanager.sampler = sampler
     config.pipeline.model.supervision = supervision
     config.pipeline.model.loss_coefficients = loss_coefficients
-    # Within 0.3 dB of the best for each of them (docs/supervision.md).
+    # Within 0.3 dB of the best for each of them, on two scenes with one seed (docs/defaults.md).
     config.pipeline.model.average_init_density = 1.0
     config.pipeline.model.camera_optimizer = PoseCorrectionConfig(mode="off")
     reduced = small(config)

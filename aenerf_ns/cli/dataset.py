@@ -54,7 +54,7 @@ class DatasetCommand:
 
     def __post_init__(self) -> None:
         if self.drop_malformed:
-            # Where the command for training is printed, it is among the options.
+            # The command for training that is printed then has the option, too.
             self.format_options += ("drop-malformed=True",)
 
     def open_dataset(self) -> EventDataParser:

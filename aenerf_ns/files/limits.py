@@ -144,12 +144,12 @@ def visible_files(folder: Path, pattern: str) -> list[Path]:
 
     Numbers in the names count as such: 2 is ahead of 10, and 0.15 ahead of 0.2.
 
-    Hidden ones do not count: macOS puts one beside each file that it copies to other disks.
+    Hidden files do not count, because macOS puts one beside each file that it copies to other disks.
     """
 
     def order(file: Path) -> tuple[list[str | float], str]:
         parts = re.split(r"(\d+(?:\.\d+)?)", file.name)
-        # Numbers of many digits may be equal as decimals.
+        # As floats, two numbers of many digits may be equal. Then the names decide.
         return [float(part) if index % 2 else part for index, part in enumerate(parts)], file.name
 
     return sorted((file for file in folder.glob(pattern) if not file.name.startswith(".")), key=order)

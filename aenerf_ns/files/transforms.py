@@ -18,9 +18,9 @@ from aenerf_ns.errors import DataError, value_errors_as_data_error
 from aenerf_ns.files.json_file import Nanoseconds, convert, read_json
 
 _MOUNT = "T_frame_event"
-# What other programs call the distortion and its model.
+# Other programs write the distortion or the model of a lens under these keys, which are not read.
 _UNREAD_LENS = "dist(_|$)|(?!.*undistort).*distort|(is_)?fisheye$|lens_model"
-# Names of parts of a lens, also other programs'.
+# Each of these keys states a part of a lens, in this format or in another program's.
 _LENS = {"camera_model", "k1", "k2", "k3", "k4", "p1", "p2", "fl_x", "fx", "K", "camera_matrix", "intrinsics"}
 Vector = tuple[float, float, float]
 Row = tuple[float, float, float, float]
@@ -132,7 +132,7 @@ def read_transforms(path: Path, image_encoding: ImageEncoding = "srgb") -> tuple
         remedy = f"state {_MOUNT} in event_camera, which takes points from its coordinates to the frame camera's"
         raise DataError(path, f"it states {stated[0]}, which is not read", remedy)
     if isinstance(camera, dict) and camera.keys().isdisjoint(("fl_x", "fl_y", "cx", "cy")):
-        # Without a size at the top, no other camera has the lens there.
+        # A lens at the top is the frame camera's only where a size stands beside it.
         if lens := sorted((camera if "w" in values else {**values, **camera}).keys() & _LENS):
             problem = f"it states {lens[0]}, but event_camera has no fl_x, fl_y, cx and cy"
             raise DataError(path, problem, f"state these too, or leave {lens[0]} out: all is then estimated")

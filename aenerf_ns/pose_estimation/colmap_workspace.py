@@ -128,7 +128,7 @@ class ColmapWorkspace:
         # COLMAP's log would break the progress bars.
         pycolmap.logging.minloglevel = pycolmap.logging.Level.FATAL.value
         self._names = [f"{index:08d}.png" for index in range(num_frames)]
-        # COLMAP takes no seed of 32 bits.
+        # COLMAP's seeds have 31 bits.
         self._seed = seed % 2**31
         self._progress = progress
         self._min_motion = min_motion
