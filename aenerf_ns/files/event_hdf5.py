@@ -39,6 +39,8 @@ def _columns_of(group: str) -> dict[str, tuple[str, None]]:
 _NATIVE = EventLayout(_columns_of("events/"), "ns")
 # DSEC, and TUM-VIE, which has no offset.
 COLUMNS_IN_GROUP = EventLayout(_columns_of("events/"), time_offset="t_offset")
+# event_utils, in which many datasets with frames are published.
+_PLURAL_COLUMNS = EventLayout({name: (f"events/{name}s", None) for name in _DTYPES})
 # EDS.
 COLUMNS_AT_TOP = EventLayout(_columns_of(""), time_offset="t_offset")
 # PAEv3D.
@@ -46,7 +48,7 @@ TXYP_MATRIX = EventLayout({name: ("events", index) for index, name in enumerate(
 # Prophesee's Metavision.
 PROPHESEE_RECORDS = EventLayout({name: ("CD/events", name) for name in _DTYPES})
 
-_LAYOUTS = (PROPHESEE_RECORDS, COLUMNS_IN_GROUP, COLUMNS_AT_TOP, TXYP_MATRIX)
+_LAYOUTS = (PROPHESEE_RECORDS, COLUMNS_IN_GROUP, _PLURAL_COLUMNS, COLUMNS_AT_TOP, TXYP_MATRIX)
 
 
 class Hdf5TableFile(EventTableFile):
@@ -119,7 +121,7 @@ class Hdf5EventFile(Hdf5TableFile):
 
 
 def open_hdf5_events(path: Path, width: int | None, height: int | None, time_unit: TimeUnit | None = None) -> EventFile:
-    """Open an HDF5 file of events. Its content tells the format: native, DSEC, TUM-VIE, EDS, Prophesee or PAEv3D.
+    """Open an HDF5 file of events. The names in it tell the layout.
 
     Args:
         path: the file.
@@ -135,7 +137,7 @@ def open_hdf5_events(path: Path, width: int | None, height: int | None, time_uni
         for layout in _LAYOUTS:
             if all(_dataset(path, file, name) is not None for name in layout.arrays):
                 return Hdf5TableFile(path, *resolve_sensor_size(path, stated, width, height), layout, time_unit)
-        remedy = "events must be in /events/{x,y,t,p}, in /x, /y, /t and /p, in /CD/events, or in a matrix /events"
+        remedy = "events must be in /events/{x,y,t,p} or {xs,ys,ts,ps}, /x, /y, /t, /p, /CD/events, or a matrix /events"
         raise DataError(path, f"it holds {', '.join(sorted(file)) or 'nothing'}", remedy)
 
 

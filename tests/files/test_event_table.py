@@ -49,6 +49,7 @@ LAYOUTS: dict[str, tuple[str, Callable[[Path, Columns], object]]] = {
     "records": ("events.npy", lambda path, columns: np.save(path, records(columns))),
     "DSEC": ("dsec.h5", write_dsec),
     "TUM-VIE": ("tum_vie.h5", write_tum_vie),
+    "event_utils": ("utils.h5", lambda path, columns: write_eds(path, {f"events/{c}s": v for c, v in columns.items()})),
     "EDS": ("eds.h5", write_eds),
     "PAEv3D": ("paev3d.hdf5", write_paev3d),
     "Prophesee": ("prophesee.hdf5", write_prophesee),
