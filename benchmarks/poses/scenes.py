@@ -51,6 +51,7 @@ _MIDDLE = "--width 160 --height 120"
 _FEW_FRAMES = "--max-displacement 1"
 _SENSOR_240 = f"--width 240 --height 180 {_FEW_FRAMES} --validation-views 4 --test-views 10"
 _RGGB = "--bayer-pattern RGGB"
+_DAVIS346 = "--sensor davis346"
 _JUMPS = "--pose-noise-kind gauss-markov --pose-noise-correlation-time 0.078"
 _LARGE_NOISE = "--pose-noise-degrees 3 --pose-noise-translation 0.08"
 SCENES = {
@@ -60,6 +61,8 @@ SCENES = {
         ("room", "choose", "room", "hard", "seen from within", f"{_SMALL} {_NOISE} --seed 5"),
         ("outwards", "choose", OUTWARDS, "easy", "slow noise, no revisits", f"{_SMALL} {_SLOW_NOISE} --seed 6"),
         ("forklift", "choose", "forklift", "hard", "color, on a floor", f"{_SMALL} {_NOISE} {_RGGB} --seed 7"),
+        ("object davis346", "choose", "object", "hard", "a real sensor", f"{_SMALL} {_NOISE} {_DAVIS346} --seed 77"),
+        ("room davis346", "choose", "room", "hard", "a real sensor", f"{_SMALL} {_NOISE} {_DAVIS346} --seed 5"),
         ("games", "report", "games", "hard", "large in the picture", f"{_SMALL} {_NOISE} --seed 11"),
         ("plants", "report", "plants", "easy", "color, fine structures", f"{_SMALL} {_NOISE} {_RGGB} --seed 12"),
         ("workshop", "report", "workshop", "hard", "a large place", f"{_SMALL} {_NOISE} --seed 13"),
@@ -69,9 +72,9 @@ SCENES = {
         ("object large noise", "events", "object", "hard", "large noise, middle size",
          f"{_MIDDLE} {_FEW_FRAMES} {_LARGE_NOISE} --seed 18"),
         ("room large noise davis346", "events", "room", "easy", "large noise, a real sensor",
-         f"{_MIDDLE} {_FEW_FRAMES} {_LARGE_NOISE} --sensor davis346 --seed 15"),
+         f"{_MIDDLE} {_FEW_FRAMES} {_LARGE_NOISE} {_DAVIS346} --seed 15"),
         ("object large noise davis346", "events", "object", "hard", "large noise, a real sensor",
-         f"{_MIDDLE} {_FEW_FRAMES} {_LARGE_NOISE} --sensor davis346 --seed 18"),
+         f"{_MIDDLE} {_FEW_FRAMES} {_LARGE_NOISE} {_DAVIS346} --seed 18"),
         ("room Gauss-Markov", "events", "room", "hard", "noise that jumps from pose to pose",
          f"{_MIDDLE} {_FEW_FRAMES} {_NOISE} {_JUMPS} --seed 19"),
         ("object COLMAP 25 Hz", "report", "object", "hard", "COLMAP's own errors",
@@ -87,7 +90,7 @@ SCENES = {
             for name, speed, about, options, seed in (
                 ("easy", "easy", "240 x 180", "", easy),
                 ("hard", "hard", "240 x 180", "", hard),
-                ("davis346", "hard", "240 x 180, a real sensor", "--sensor davis346", hard),
+                ("davis346", "hard", "240 x 180, a real sensor", _DAVIS346, hard),
                 ("Gauss-Markov", "hard", "240 x 180, noise that jumps from pose to pose", _JUMPS, hard),
             )
         ),
