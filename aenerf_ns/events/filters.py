@@ -187,11 +187,9 @@ class EventSelection:
     def filtered(self, chunks: Iterable[EventStream]) -> Iterator[EventStream]:
         """Yield the kept events of each chunk. Pass every chunk of the source, in order. Find the hot pixels before."""
         x, y, width, height = self._region
-        last_kept = np.full(self._keep.size, _NEVER, np.int64)
+        last_kept = np.full(self._keep.shape, _NEVER)
         for chunk in self._within(chunks):
-            kept = _select(
-                chunk.x, chunk.y, chunk.t, self._keep.ravel(), chunk.width, self._filters.shortest_interval, last_kept
-            )
+            kept = _select(chunk.x, chunk.y, chunk.t, self._keep, self._filters.shortest_interval, last_kept)
             part = chunk[kept]
             yield replace(part, x=part.x - np.uint16(x), y=part.y - np.uint16(y), width=width, height=height)
 
@@ -202,11 +200,11 @@ class EventSelection:
 
 
 @numba.njit(cache=True)
-def _select(x, y, t, keep, width, shortest_interval, last_kept):
+def _select(x, y, t, keep, shortest_interval, last_kept):
     """Return (N,) bool, whether each event is kept. Updates ``last_kept``, which is passed on from chunk to chunk."""
     kept = np.zeros(x.shape[0], np.bool_)
     for i in range(x.shape[0]):
-        pixel = np.int64(y[i]) * width + x[i]
+        pixel = y[i], x[i]
         if keep[pixel] and (last_kept[pixel] == _NEVER or t[i] - last_kept[pixel] >= shortest_interval):
             kept[i] = True
             last_kept[pixel] = t[i]

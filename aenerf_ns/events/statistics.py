@@ -57,30 +57,30 @@ def event_statistics(
         time_span: times of the first and the last event in nanoseconds.
         num_parts: parts of the time span in which events are counted.
     """
-    counts, last_time = np.zeros(width * height, np.int64), np.full(width * height, _NEVER, np.int64)
+    counts, last_time = np.zeros((height, width), np.int64), np.full((height, width), _NEVER)
     rate = np.zeros(num_parts, np.int64)
     sample, state = np.empty((2 * _MAX_PAIRS, 2), np.int64), np.array([0, 0, 1], np.int64)
     start, end = time_span
     num_positive = num_repeated = 0
     for chunk in chunks:
         num_positive += int((chunk.p > 0).sum())
-        num_repeated += _count(chunk.x, chunk.y, chunk.t, width, counts, last_time, sample, state)
+        num_repeated += _count(chunk.x, chunk.y, chunk.t, counts, last_time, sample, state)
         # Integers are exact up to 292 years. Seconds since 1970 in float64 would put events into other parts.
         part = (chunk.t - start) // max(-(-(end - start + 1) // num_parts), 1)
         rate += np.bincount(part.clip(0, num_parts - 1), minlength=num_parts)
     pair_times = sample[: state[1]].copy()
-    return EventStatistics(counts.reshape(height, width), num_positive, num_repeated, rate, pair_times, start, end)
+    return EventStatistics(counts, num_positive, num_repeated, rate, pair_times, start, end)
 
 
 @numba.njit(cache=True)
-def _count(x, y, t, width, counts, last_time, sample, state):
+def _count(x, y, t, counts, last_time, sample, state):
     """Continue the counts with one chunk, and return the number of repeated events.
 
     ``state`` holds the number of pairs, the number of sampled pairs, and the step from one sampled pair to the next.
     """
     repeated = 0
     for i in range(t.shape[0]):
-        pixel = np.int64(y[i]) * width + x[i]
+        pixel = y[i], x[i]
         counts[pixel] += 1
         previous = last_time[pixel]
         last_time[pixel] = t[i]
