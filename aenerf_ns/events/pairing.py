@@ -75,11 +75,10 @@ def pair_events(
     """
     table: _Table | None = None
     pieces = window.pieces()
-    piece = total = outside = 0
+    piece = total = inside = 0
     source: str | Path = "events"
     for full_chunk in chunks:
         total += len(full_chunk)
-        outside += len(full_chunk)
         source = full_chunk.source
         if table is None:
             shape = (full_chunk.height, full_chunk.width)
@@ -94,7 +93,7 @@ def pair_events(
         for index, chunk in enumerate(full_chunk.between(*times) for times in pieces):
             if len(chunk) == 0:
                 continue
-            outside -= len(chunk)
+            inside += len(chunk)
             if index != piece:
                 # After a gap every pixel begins anew.
                 piece = index
@@ -104,14 +103,14 @@ def pair_events(
                     table.file, table.folder = open_file()
                 table.flush()
             table.add(chunk)
-    if table is None or total == outside:
+    if table is None or inside == 0:
         raise DataError(
             source,
             f"none of its {total} events lies between {window.start} and {window.end} ns, the span of the poses "
             "and the time window",
             "check that events and poses share one clock and one unit of time",
         )
-    return table.pairs(total, outside)
+    return table.pairs(total, total - inside)
 
 
 class _Table:
