@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from bisect import bisect_right
+from collections import Counter
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
@@ -32,7 +33,7 @@ class LeftOut:
         """Forget all counts, because the file is read from its beginning."""
         self._last_time: int | None = None
         self.waiting: list[NDArray] = []
-        self._counts: dict[str, int] = {}
+        self._counts: Counter[str] = Counter()
         self._first: dict[str, str] = {}
 
     def add(self, reason: str, bad: NDArray[np.bool_], describe: Callable[[int], str]) -> None:
@@ -42,7 +43,7 @@ class LeftOut:
 
     def add_number(self, reason: str, number: int, where: str) -> None:
         """Count events that are left out for a reason, the first of them at a place."""
-        self._counts[reason] = self._counts.get(reason, 0) + number
+        self._counts[reason] += number
         self._first.setdefault(reason, where)
 
     def in_order(self, columns: Sequence[NDArray]) -> list[NDArray]:
@@ -80,7 +81,7 @@ class LeftOut:
 
     def require_few(self, source: Path, num_kept: int) -> None:
         """Raise a DataError if so many events are left out that the file must have been read wrongly."""
-        number = sum(self._counts.values())
+        number = self._counts.total()
         if number > max(_FEW, _MAX_SHARE * (num_kept + number)):
             problem = f"{number:,} of its {num_kept + number:,} events are malformed: {self.summary()}"
             remedy = "only a thousandth may be left out: check the sensor's size, the format and the unit of the times"
