@@ -51,17 +51,18 @@ class ReportCommand:
         from aenerf_ns.report.sections import VIEW_COLUMNS, view_rows
 
         # Measuring takes long, and only one run at a time is sure to fit in the memory. So the runs are opened twice.
-        opened: list[tuple[TrainerConfig, Protocol]] = []
+        configs: list[TrainerConfig] = []
+        protocols: list[Protocol] = []
         for run in self.runs:
             config, opened_run, _ = open_run(run, self.data)
-            opened.append((config, comparison.read_protocol(opened_run)))
+            configs.append(config)
+            protocols.append(comparison.read_protocol(opened_run))
             del opened_run
             gc.collect()
-        if self.data is not None and len({config.__dict__["data_at_training"] for config, _ in opened}) > 1:
+        if self.data is not None and len({config.__dict__["data_at_training"] for config in configs}) > 1:
             problem = "--data names one dataset, but the runs were trained on several"
             raise DataError("aenerf report", problem, "leave it out, and link the datasets to where they were")
-        names = _names([config for config, _ in opened])
-        protocols = [protocol for _, protocol in opened]
+        names = _names(configs)
         mixed = comparison.protocol_differences(names, protocols)
         if mixed and not self.allow_different_protocols:
             problem = f"the runs are measured differently: {'; '.join(mixed)}"

@@ -106,11 +106,7 @@ class RunReport:
 
 
 def measure_run(
-    name: str,
-    config: TrainerConfig,
-    run: TrainedRun,
-    candidates: Sequence[str] = (),
-    shown: dict[str, str] | None = None,
+    name: str, config: TrainerConfig, run: TrainedRun, candidates: Sequence[str], shown: dict[str, str] | None
 ) -> RunReport:
     """Measure a trained run that is opened to be tested.
 
