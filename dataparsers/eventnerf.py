@@ -89,8 +89,7 @@ class EventNeRFDataParserConfig(EvenPosesDataParserConfig):
 
     @classmethod
     def recognizes(cls, data: Path) -> bool:
-        splits = (split for split in _training_splits(data) if (split / "intrinsics").is_dir())
-        return any((split / "pose").is_dir() or (split / "events").is_dir() for split in splits)
+        return any((split / "pose").is_dir() or (split / "events").is_dir() for split in _training_splits(data))
 
 
 class EventNeRFDataParser(EventDataParser):
@@ -128,12 +127,13 @@ class EventNeRFDataParser(EventDataParser):
         return capture, []
 
     def _split(self) -> Path:
-        splits = [split for split in _training_splits(self.data) if (split / "intrinsics").is_dir()]
+        splits = _training_splits(self.data)
         return require_one(splits, self.data, "training splits (train/intrinsics)", "give the folder of one as --data")
 
 
 def _training_splits(data: Path) -> list[Path]:
-    return [data] if (data / "intrinsics").is_dir() else sorted(path for path in data.glob("train*") if path.is_dir())
+    folders = [data] if (data / "intrinsics").is_dir() else data.glob("train*")
+    return sorted(folder for folder in folders if (folder / "intrinsics").is_dir())
 
 
 def _held_out_views(scene: Path) -> dict[Split, list[ReferenceView]]:

@@ -143,11 +143,11 @@ def _read_poses(path: Path) -> Trajectory:
 
 def _read_views(folder: Path) -> tuple[CameraIntrinsics | None, dict[Split, list[ReferenceView]]]:
     """Read the lens of the views, or None where there are no views, and the views of the val and the test split."""
-    root = next((views for views in (folder / "views", folder.parent / "views") if views.is_dir()), None)
+    root = next((views for views in (folder / "views", folder.parent / "views") if views.is_dir()), folder / "views")
     camera: CameraIntrinsics | None = None
     splits: dict[Split, list[ReferenceView]] = {"val": [], "test": []}
     for split, views in splits.items():
-        path = folder if root is None else root / f"transforms_{split}.json"
+        path = root / f"transforms_{split}.json"
         if not path.is_file():
             continue
         meta = read_json(path, _Views)
