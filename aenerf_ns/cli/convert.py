@@ -107,7 +107,7 @@ class Convert(DatasetCommand):
         from aenerf_ns.recording.time_units import require_covered
 
         has_given_poses = self.poses in ("given", "refined")
-        capture, images = (parser.recording, []) if has_given_poses else parser.read_frames()
+        capture, images = (parser.recording, parser.recording.frames) if has_given_poses else parser.read_frames()
         source = capture.event_file
         events = EventSelection(source.path, source.width, source.height, filters, capture.sensor.bayer_pattern)
         # Refused before poses are found, which may take hours.
@@ -115,17 +115,16 @@ class Convert(DatasetCommand):
             problem = f"a region of interest from pixel {self.region[0]} {self.region[1]} of a color sensor"
             remedy = "begin it at an even column and row, so that the Bayer pattern begins there as on the whole sensor"
             raise DataError("aenerf convert", problem, remedy)
-        copied = images if self.poses == "events" and capture.frame_camera == capture.event_camera else []
-        if self.poses == "refined":
-            _, copied = parser.read_frames()
-        for time, file in copied:
-            if filters.window.contains(time):
-                check_image(file, capture.frame_camera)
+        has_own_frames = capture.frame_camera == capture.event_camera
+        if self.poses == "refined" or (self.poses == "events" and has_own_frames):
+            for time, file in images:
+                if filters.window.contains(time):
+                    check_image(file, capture.frame_camera)
         report = picture = None
         if has_given_poses:
             recording = parser.recording
-            if self.start_time_ns is None or self.end_time_ns is None:
-                parser.event_span(recording)
+            # For its errors.
+            parser.event_span(recording, self.start_time_ns, self.end_time_ns)
             if self.poses == "refined":
                 recording, report, picture = self._with_refined_poses(parser, recording, filters.window)
         else:

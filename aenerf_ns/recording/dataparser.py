@@ -215,10 +215,7 @@ class EventDataParser(DataParser):
             DataError: events and poses do not overlap.
         """
         recording, config = self.recording, self.config
-        start, end = config.start_time_ns, config.end_time_ns
-        if start is None or end is None:
-            first, last = self.event_span(recording)
-            start, end = first if start is None else start, last if end is None else end
+        start, end = self.event_span(recording, config.start_time_ns, config.end_time_ns)
         if start == end and config.start_time_ns is None and config.end_time_ns is None:
             raise DataError(str(config.data), f"all its events are at {start} ns", "check the unit of the times")
         if start >= end:
@@ -228,14 +225,19 @@ class EventDataParser(DataParser):
         start, end = max(start, covered.start), min(end, covered.end)
         return TimeWindow(start, end, self._pose_gaps(recording, start, end))
 
-    def event_span(self, recording: Recording) -> tuple[int, int]:
+    def event_span(self, recording: Recording, start: int | None, end: int | None) -> tuple[int, int]:
         """Return the times of the first and the last event of a recording that this parser has read, in nanoseconds.
+
+        ``start`` and ``end`` stand in place of these. Where both are given, the events are not looked at.
 
         Raises:
             DataError: the events are missing, or fit the poses only if the times of either have another unit.
         """
+        if start is not None and end is not None:
+            return start, end
         options = [name for name in ("event_time_unit", "time_unit") if hasattr(self.config, name)]
-        return require_one_unit(recording.event_file, recording.trajectory, *options or ("",))
+        first, last = require_one_unit(recording.event_file, recording.trajectory, *options or ("",))
+        return first if start is None else start, last if end is None else end
 
     def resolved_config(self) -> EventDataParserConfig:
         """Return the configuration with the time window that is used, so that opening a trained run needs no events."""
