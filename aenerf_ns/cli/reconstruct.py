@@ -21,7 +21,6 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from aenerf_ns.camera.time_window import TimeWindow
     from aenerf_ns.events.stream import EventStream
     from aenerf_ns.reconstruction.images import ImageSource
     from aenerf_ns.recording.dataparser import EventDataParser
@@ -62,12 +61,11 @@ class Reconstruct(DatasetCommand):
         recording = parser.recording
         source = self._source(recording)
         camera = recording.event_camera
-        known = recording.trajectory.known_time(recording.max_pose_gap)
         with open_writer(lock, parser, recording, camera, camera) as writer:
             writer.add_trajectories(recording.trajectory, recording.ground_truth)
             writer.copy_poses_report(recording.trajectory)
             _add_reference_views(recording, writer)
-            images = self._write_images(recording, source, known, writer)
+            images = self._write_images(recording, source, writer)
             num_images = write_video(writer.other_file(_VIDEO), images, _VIDEO_RATE)
         say(
             f"{self.output}: {num_images} images of the events, and {_VIDEO}.\n"
@@ -89,13 +87,14 @@ class Reconstruct(DatasetCommand):
         return NetworkImages(load_network(self.weights), recording.sensor, device)
 
     def _write_images(
-        self, recording: Recording, source: ImageSource, known: TimeWindow, writer: NativeDatasetWriter
+        self, recording: Recording, source: ImageSource, writer: NativeDatasetWriter
     ) -> Iterator[NDArray[np.uint8]]:
         """Write the events and an image of each batch of them that ends at a time with a pose. Yield the images."""
         from aenerf_ns.camera.trajectory import homogeneous
 
         # The views of a dataset are in the world of its true poses where it has these, whatever poses are trained on.
         events, reference = recording.event_file, recording.reference_trajectory
+        known = recording.trajectory.known_time(recording.max_pose_gap)
         num_events = max(int(self.events_per_pixel * events.width * events.height), 1)
 
         def copied() -> Iterator[EventStream]:
