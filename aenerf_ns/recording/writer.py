@@ -122,7 +122,7 @@ class NativeDatasetWriter(_FolderWriter):
         super().__init__(folder, sensor)
         self._camera = event_camera
         frame_camera = event_camera if frame_camera is None else frame_camera
-        self._files: dict[Path, dict[str, Any]] = {}
+        self._names: dict[Path, str] = {}
         self._meta: dict[str, Any] = {
             "w": frame_camera.width,
             "h": frame_camera.height,
@@ -216,19 +216,19 @@ class NativeDatasetWriter(_FolderWriter):
         ``background``, RGB in [0, 1] in the image's encoding, is composed with an image that has an alpha channel,
         because the dataset format has none. The other arguments are those of :meth:`add_image`.
         """
-        if file in self._files:
-            self._meta[f"{split}_filenames"].append(self._files[file]["file_path"])
+        if file in self._names:
+            self._meta[f"{split}_filenames"].append(self._names[file])
             return
         with Image.open(file) as image:
             values = None if background is None or image.mode != "RGBA" else np.asarray(image, np.float64) / 255
-        frame = self._add_frame(split, file.suffix if values is None else ".png", camera_to_world, time)
-        self._files[file] = frame
+        name = self._add_frame(split, file.suffix if values is None else ".png", camera_to_world, time)["file_path"]
+        self._names[file] = name
         if values is None:
-            shutil.copyfile(file, self._partial / frame["file_path"])
+            shutil.copyfile(file, self._partial / name)
             return
         alpha = values[..., 3:]
         composed = values[..., :3] * alpha + np.array(background) * (1 - alpha)
-        Image.fromarray(np.rint(composed * 255).astype(np.uint8)).save(self._partial / frame["file_path"])
+        Image.fromarray(np.rint(composed * 255).astype(np.uint8)).save(self._partial / name)
 
     def _add_frame(self, split: Split, suffix: str, camera_to_world: Tensor, time: int | None) -> dict[str, Any]:
         names = self._meta[f"{split}_filenames"]
