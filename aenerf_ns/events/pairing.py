@@ -81,14 +81,8 @@ def pair_events(
         total += len(full_chunk)
         source = full_chunk.source
         if table is None:
-            shape = (full_chunk.height, full_chunk.width)
-            used = np.ones(shape, bool) if usable is None else usable
-            if used.shape != shape:
-                raise DataError(
-                    source,
-                    f"its sensor has {shape[1]} x {shape[0]} pixels, its lens model {used.shape[1]} x {used.shape[0]}",
-                    "state one size",
-                )
+            used = np.ones((full_chunk.height, full_chunk.width), bool) if usable is None else usable
+            full_chunk.require_size_of(used)
             table = _Table(used, refractory_period, source)
         for index, chunk in enumerate(full_chunk.between(*times) for times in pieces):
             if len(chunk) == 0:

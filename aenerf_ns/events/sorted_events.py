@@ -99,9 +99,7 @@ def sort_events(chunks: Iterable[EventStream], *, window: TimeWindow, usable: ND
     source: str | Path = "events"
     for chunk in chunks:
         source = chunk.source
-        if (chunk.height, chunk.width) != usable.shape:
-            problem = f"its sensor has {chunk.width} x {chunk.height} pixels, its lens model {width} x {height}"
-            raise DataError(source, problem, "state one size")
+        chunk.require_size_of(usable)
         total += len(chunk)
         kept = window.contains(chunk.t)
         inside += int(kept.sum())

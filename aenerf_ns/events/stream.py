@@ -97,6 +97,13 @@ class EventStream:
         columns = {name: np.concatenate([getattr(part, name) for part in parts]) for name in _COLUMNS}
         return replace(parts[0], **columns)
 
+    def require_size_of(self, usable: NDArray[np.bool_]) -> None:
+        """Raise a DataError if the sensor does not have the size of (height, width) pixels of a lens model."""
+        height, width = usable.shape
+        if (self.height, self.width) != (height, width):
+            problem = f"its sensor has {self.width} x {self.height} pixels, its lens model {width} x {height}"
+            raise DataError(self.source, problem, "state one size")
+
     def between(self, start: int, end: int) -> EventStream:
         """Return the events with start <= t <= end, in nanoseconds."""
         return self[np.searchsorted(self.t, start) : np.searchsorted(self.t, end, "right")]
