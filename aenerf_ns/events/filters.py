@@ -60,7 +60,7 @@ class EventFilters:
                 raise ValueError(f"the time window {what} at {time} ns, which must fit in 64 bits")
         if not 0 <= self.shortest_interval <= LAST_TIME:
             raise ValueError(f"the shortest interval must be from 0 to {LAST_TIME} ns, not {self.shortest_interval}")
-        if self.start is not None and self.end is not None and self.start > self.end:
+        if self.window.start > self.window.end:
             raise ValueError(f"the time window ends at {self.end} ns, before it begins at {self.start} ns")
         if self.region is not None and (min(self.region[:2]) < 0 or min(self.region[2:]) <= 0):
             raise ValueError(f"the region of interest {self.region} must be x, y, width, height, of positive size")

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from aenerf_ns.errors import DataError
 from aenerf_ns.files.event_reader import EventFile
-from aenerf_ns.files.event_table import EventLayout, EventTableFile
+from aenerf_ns.files.event_table import FORMATS_REMEDY, EventLayout, EventTableFile
 from aenerf_ns.files.limits import bounded, require_unpacked_size
 from aenerf_ns.files.text import TimeUnit
 
@@ -101,7 +101,7 @@ def open_npz_member(path: Path, name: str) -> Iterator[tuple[IO[bytes], zipfile.
     """
     with bounded(path, ".npz file"), zipfile.ZipFile(path) as archive:
         if f"{name}.npy" not in archive.namelist():
-            raise DataError(path, f"it has no array {name}", "see the formats in the docs")
+            raise DataError(path, f"it has no array {name}", FORMATS_REMEDY)
         entry = archive.getinfo(f"{name}.npy")
         require_unpacked_size(path, f"its array {name}", entry.file_size, min(entry.compress_size, path.stat().st_size))
         with bounded(path, f"array {name}"), archive.open(entry) as member:
