@@ -12,7 +12,6 @@ from aenerf_ns.files.text import UNIT_NAMES
 Span = tuple[int, int]
 
 _UNITS: list[str] = list(UNIT_NAMES)
-_NAMES = list(UNIT_NAMES.values())
 # Events do not fit poses if fewer poses lie among them, or if poses cover a smaller share of their time.
 _MIN_POSES, _MIN_COVERED = 10, 0.1
 # Two spans fit by chance less often, the more of the time that either covers is covered by both.
@@ -25,8 +24,7 @@ def require_one_unit(events: EventFile, poses: Trajectory, option: str) -> Span:
     """Return the times of the first and the last event in nanoseconds.
 
     Args:
-        events: the events.
-        poses: their poses, whose times were read as seconds.
+        poses: of the events; their times were read as seconds.
         option: the dataparser's option for the unit of the events, or "" if it has none.
 
     Raises:
@@ -35,20 +33,18 @@ def require_one_unit(events: EventFile, poses: Trajectory, option: str) -> Span:
     """
     span, known = events.time_span(), (poses.start, poses.end)
     seconds, covered = (span[1] - span[0]) * 1e-9, _common(span, known)
-    is_given = len(poses.knots_between(*span)) >= _MIN_POSES and covered >= _MIN_COVERED * (span[1] - span[0])
+    is_covered = covered >= _MIN_COVERED * (span[1] - span[0])
+    is_given = is_covered and len(poses.knots_between(*span)) >= _MIN_POSES
     power = unit_steps(span, known, _SURE_OVERLAP if is_given else _MIN_OVERLAP)
     if power is None and covered <= 0 and poses.duration < _MIN_COVERED * seconds:
         power = _steps_into(span, poses)
     # The time of one damaged event, at an end, says nothing of the unit.
     if power is None or (power < 0 and _share_within(events, known) >= _MIN_COVERED):
         return span
-    # A short part at the beginning looks like that, too.
-    is_part = power > 0 and covered >= _MIN_COVERED * (span[1] - span[0])
-    part = (
-        ", or, if this part is what you want, give its start-time-ns and end-time-ns as options of the format"
-        if is_part
-        else ""
-    )
+    part = ""
+    if power > 0 and is_covered:
+        # A short part at the beginning looks like that, too.
+        part = ", or, if this part is what you want, give its start-time-ns and end-time-ns as options of the format"
     problem = f"the poses last {poses.duration:g} s and the events {seconds:g} s, as if the times of "
     source = poses.source if power > 0 else events.path
     if not option:
@@ -58,14 +54,14 @@ def require_one_unit(events: EventFile, poses: Trajectory, option: str) -> Span:
         raise DataError(source, problem, "correct the unit of either" + part)
     blamed, remedies = [], []
     assumed = events.assumed_unit()
+    index = -1 if assumed is None else _UNITS.index(assumed) + power
     is_short, is_long = seconds < _SHORTEST, poses.duration > _LONGEST
-    if assumed is not None and 0 <= _UNITS.index(assumed) + power < len(_UNITS) and not (power > 0 and is_long):
-        index = _UNITS.index(assumed) + power
+    if 0 <= index < len(_UNITS) and not (power > 0 and is_long):
         unit = _UNITS[index]
-        blamed.append(f"the events were in {_NAMES[index]}")
+        blamed.append(f"the events were in {UNIT_NAMES[unit]}")
         remedies.append(f"give --{option.replace('_', '-')} {unit} (in aenerf --format-options {option}={unit})")
     if power > 0 and not (blamed and is_short):
-        blamed.append(f"the poses were in {_NAMES[-1 - power]}")
+        blamed.append(f"the poses were in {UNIT_NAMES[_UNITS[-1 - power]]}")
         remedies.append("write the times of the poses in seconds")
     if not blamed:
         return span
