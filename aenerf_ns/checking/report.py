@@ -32,7 +32,6 @@ def check(
     """Check a recording: its events and its lens, and where it has poses, these, and whether they fit the events.
 
     Args:
-        recording: the recording.
         frames: times in nanoseconds and files.
         window: the time that training uses; to be given where there are poses.
         scale: scene units in a unit of the poses.

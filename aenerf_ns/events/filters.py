@@ -123,12 +123,7 @@ def _median_around(counts: NDArray[np.integer]) -> NDArray[np.float32]:
 
 
 def hot_pixel_summary(hot: NDArray[np.bool_], counts: NDArray[np.integer]) -> str:
-    """Describe the hot pixels in one line, those with the most events by name.
-
-    Args:
-        hot: (height, width) whether a pixel is hot.
-        counts: (height, width) number of events of every pixel.
-    """
+    """Describe the hot pixels of :func:`find_hot_pixels` in one line, those with the most events by name."""
     if not hot.any():
         return "Hot pixels: none."
     rows, columns = np.nonzero(hot)
@@ -144,8 +139,7 @@ class EventSelection:
 
     Args:
         source: the file, for messages.
-        width: number of pixel columns of its sensor.
-        height: number of pixel rows of its sensor.
+        width, height: size of its sensor in pixels.
         filters: the events to keep.
         bayer_pattern: of a color sensor; see :func:`find_hot_pixels`.
 

@@ -54,8 +54,7 @@ class EventPairs:
         block_ends: (B + 1,) int64, nanoseconds from the first interval's start to the end of each block of 16 rows,
             when the intervals of all pairs are laid end to end. Block b is the rows from 16 b to 16 b + 15, and ends at
             ``block_ends[b + 1]``.
-        width: number of pixel columns of the sensor.
-        height: number of pixel rows of the sensor.
+        width, height: size of the sensor in pixels.
         shortest_interval: nanoseconds between the two events of the closest pair.
         num_events: events in the stream.
         num_outside: events outside the time window or in a gap, which are left out.

@@ -24,8 +24,7 @@ class SortedEvents:
     Attributes:
         times: (N,) int64 nanoseconds, never decreasing.
         codes: (N,) uint32, twice the number of the event's pixel, counted row by row, plus one for a negative event.
-        width: number of pixel columns of the sensor.
-        height: number of pixel rows of the sensor.
+        width, height: size of the sensor in pixels.
         pieces: first and last time of each stretch in which the poses are known, in nanoseconds.
         num_outside: events left out, outside the time window or in a gap.
         num_unusable: events left out, at pixels that are not used.
@@ -45,8 +44,7 @@ class SortedEvents:
         Windows that share an end and a start share no event and miss none.
 
         Args:
-            start: nanoseconds.
-            end: nanoseconds.
+            start, end: nanoseconds.
 
         Returns:
             (2, pixels) numbers of positive and of negative events.

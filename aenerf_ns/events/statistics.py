@@ -52,8 +52,7 @@ def event_statistics(
 
     Args:
         chunks: the stream in pieces, in the order of time.
-        width: number of pixel columns.
-        height: number of pixel rows.
+        width, height: size of the sensor in pixels.
         time_span: times of the first and the last event in nanoseconds.
         num_parts: parts of the time span in which events are counted.
     """

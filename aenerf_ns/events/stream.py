@@ -41,8 +41,7 @@ class EventStream:
         y: (N,) uint16 pixel rows, 0 at the top.
         t: (N,) int64 times in nanoseconds, never decreasing.
         p: (N,) int8 polarities, +1 or −1.
-        width: number of pixel columns of the sensor.
-        height: number of pixel rows of the sensor.
+        width, height: size of the sensor in pixels.
         source: the file of the events, for messages.
 
     Raises:

@@ -32,8 +32,7 @@ class EventFile(ABC):
 
     Args:
         path: the file.
-        width: number of pixel columns of the sensor.
-        height: number of pixel rows of the sensor.
+        width, height: size of the sensor in pixels.
 
     Attributes:
         kind: what the file is, for messages.

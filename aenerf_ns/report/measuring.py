@@ -112,8 +112,6 @@ def measure_run(
 
     Args:
         name: by which the page tells the run apart.
-        config: of the run.
-        run: the run.
         candidates: the files of the views that may be shown; none means that all may.
         shown: the files of the views to show, and why; None chooses among the candidates by this run's metrics.
     """

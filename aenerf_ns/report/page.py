@@ -34,12 +34,8 @@ def make_page(
 ) -> str:
     """Make the HTML of a report of one or more runs.
 
-    Args:
-        reports: of the runs.
-        paired: see :func:`~aenerf_ns.report.comparison.paired_differences`.
-        left_out: see :func:`~aenerf_ns.report.comparison.views_left_out`.
-        mixed: see :func:`~aenerf_ns.report.comparison.protocol_differences`.
-        shared: see :func:`~aenerf_ns.report.comparison.shared_views`.
+    ``paired``, ``left_out``, ``mixed`` and ``shared`` are what :mod:`~aenerf_ns.report.comparison` finds:
+    ``paired_differences``, ``views_left_out``, ``protocol_differences`` and ``shared_views``.
     """
     environment = jinja2.Environment(
         autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True
