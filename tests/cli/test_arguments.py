@@ -129,7 +129,7 @@ MISTAKES = [
     ("simulate-video V --output O --refractory-period-ns -1", 1, "Error: --refractory-period-ns: -1 is out of range"),
     ("simulate --output O --poses colmap --pose-noise-degrees 1", 1, "COLMAP makes errors of its own"),
     ("simulate-video nothing --output O", 1, "Error: nothing: there is no such video"),
-    ("simulate-video F --output O --trajectory W", 1, "--trajectory without the intrinsics"),
+    ("simulate-video F --output O --trajectory W", 1, "--trajectory without the intrinsics of the camera; give"),
     ("simulate-video F --output O --calibration nothing", 1, "Error: nothing: "),
     ("evaluate nothing.yml --output O", 1, "Error: nothing.yml: there is no such file"),
     (f"evaluate {LONG} --output O", 1, f"Error: {LONG}: it cannot be read (File name too long)"),

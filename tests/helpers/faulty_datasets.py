@@ -24,7 +24,7 @@ from helpers.dataset_faults import (
     write_text,
 )
 from helpers.malformed_inputs import OBJECTS, camchain, camera
-from helpers.published_datasets import CAMCHAIN, N_EVENTS, N_POSES, make_poses, write_colmap
+from helpers.published_datasets import CAMCHAIN, N_POSES, make_poses, write_colmap
 
 # Each fault: a change of the dataset, the end of the path that the error names, and words of its problem or remedy.
 Fault = tuple[Change, str, str]
@@ -82,7 +82,6 @@ _NATIVE_FAULTS: dict[str, Fault] = {
     "offset is NaN": (set_attribute("time_offset", np.nan), "events.h5", "time_offset is nan"),
     "unknown unit": (set_attribute("time_unit", "fortnight"), "events.h5", "time unit is 'fortnight'"),
     "polarity 0": (column("p", np.zeros(200, np.int8)), "events.h5", "polarity 0"),
-    "no overlap": (column("t", np.arange(200)), "trajectory_estimated.txt", "do not overlap"),
     "no poses": (remove("trajectory_estimated.txt"), "trajectory_estimated.txt", "no such poses"),
 }
 
@@ -99,7 +98,6 @@ def image_times(ticks: int) -> Change:
 LATE = write_text("groundtruth.txt", "5 0 0 0 0 0 0 1\n6 1 0 0 0 0 0 1\n")
 _ECD_FAULTS: dict[str, Fault] = {
     "no folder": (shutil.rmtree, "made", "no such folder"),
-    "no poses": (remove("groundtruth.txt"), "groundtruth.txt", "no such poses"),
     "no calibration": (remove("calib.txt"), "calib.txt", "no such file"),
     "missing image": (remove("images/1.png"), "images.txt", "images/1.png, which does not exist"),
     "image times in ms": (image_times(10**3), "images", "images were in milliseconds"),
@@ -110,7 +108,6 @@ _ECD_FAULTS: dict[str, Fault] = {
     "seven numbers": (pose("0.2 0 0 0 0 0 1"), "groundtruth.txt", "line 3 has 7 fields"),
     "pose is a word": (pose("0.2 x 0 0 0 0 0 1"), "groundtruth.txt", "'x'"),
     "pose time is a word": (pose("now 0 0 0 0 0 0 1"), "groundtruth.txt", "now is not a time in seconds"),
-    "unsorted poses": (pose("0.05 0 0 0 0 0 0 1"), "groundtruth.txt", "pose 2 is at 50000000 ns, not after"),
     "one pose": (write_text("groundtruth.txt", "0 0 0 0 0 0 0 1\n"), "groundtruth.txt", "1 poses"),
     "no pose": (write_text("groundtruth.txt", "# nothing\n"), "groundtruth.txt", "no poses"),
     "no overlap": (LATE, "groundtruth.txt", "do not overlap the events from 10000000 to 310000000 ns"),
@@ -166,7 +163,6 @@ _ESIM_FAULTS: dict[str, Fault] = {
 }
 
 MATRIX = "train/pose/r_00003.txt"
-ONE_TIME = edit_npz("train/events/test_lego.npz", t=np.zeros(N_EVENTS, int))
 _EVENTNERF_FAULTS: dict[str, Fault] = {
     "no events": (remove("train/events"), "events.npz", "no such file"),
     "two event files": (lambda folder: np.savez(folder / "train/events/b.npz"), "train/events", "2 files *.npz"),
@@ -176,7 +172,6 @@ _EVENTNERF_FAULTS: dict[str, Fault] = {
     "NaN pose": (write_text(MATRIX, "nan " * 16), MATRIX, "not finite"),
     "mirrored": (write_text(MATRIX, "1 0 0 0  0 1 0 0  0 0 -1 0  0 0 0 1"), "train/pose", "pose 3 is not a rigid"),
     "lost image": (remove("train/rgb/00003.png"), "train/rgb", "20 images for 21 poses"),
-    "one event time": (ONE_TIME, "made", "its 21 poses are from 0 to 0 ns"),
 }
 
 
