@@ -14,7 +14,6 @@ from aenerf_ns.camera.image_encoding import ImageEncoding
 from aenerf_ns.camera.intrinsics import CameraIntrinsics
 from aenerf_ns.camera.trajectory import Trajectory
 from aenerf_ns.errors import DataError
-from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.files.calibration import Calibration, read_calibration, require_no_names
 from aenerf_ns.files.colmap import read_colmap_focal_shares, read_colmap_poses
 from aenerf_ns.files.event_reader import EventFile
@@ -173,7 +172,7 @@ def _is_event_file(data: Path) -> bool:
 def _guess_calibration(events: EventFile) -> Calibration:
     """Return a guess for a camera. Only its size is known, which the event file states."""
     camera = CameraIntrinsics.guess(events.width, events.height)
-    return Calibration(camera, camera, torch.eye(4, dtype=torch.float64), SensorModel(), "linear", "guessed")
+    return Calibration(camera, camera, torch.eye(4, dtype=torch.float64), intrinsics_origin="guessed")
 
 
 def _read_colmap(

@@ -47,8 +47,8 @@ class Calibration:
     event_camera: CameraIntrinsics
     frame_camera: CameraIntrinsics
     frame_from_event: Tensor
-    sensor: SensorModel
-    image_encoding: ImageEncoding
+    sensor: SensorModel = SensorModel()
+    image_encoding: ImageEncoding = "linear"
     intrinsics_origin: Origin = "given"
     has_assumed_thresholds: bool = True
 
@@ -84,7 +84,7 @@ def read_calibration(
     if isinstance(content, dict) and "camera_matrix" in content:
         require_no_names(path, event_camera, frame_camera)
         lens = _camera_info(path, content)
-        return Calibration(lens, lens, torch.eye(4, dtype=torch.float64), SensorModel(), "linear")
+        return Calibration(lens, lens, torch.eye(4, dtype=torch.float64))
     cameras = read_camchain(path)
     if len(cameras) > 1:
         for name, what, option in ((event_camera, "events", "event"), (frame_camera, "images", "frame")):
@@ -97,7 +97,7 @@ def read_calibration(
         if name not in cameras:
             raise DataError(path, f"it has no camera {name}", f"name one of {', '.join(cameras)}")
     motion = motion_between(path, cameras, event_name, frame_name)
-    return Calibration(cameras[event_name].lens(), cameras[frame_name].lens(), motion, SensorModel(), "linear")
+    return Calibration(cameras[event_name].lens(), cameras[frame_name].lens(), motion)
 
 
 def require_no_names(path: Path, *names: str | None) -> None:
