@@ -118,9 +118,8 @@ class _Table:
     """
 
     def __init__(self, usable: NDArray[np.bool_], refractory_period: int, source: str | Path) -> None:
-        height, width = usable.shape
         self._usable = usable.ravel()
-        self._shape = (width, height)
+        self._shape = usable.shape
         self._refractory_period = refractory_period
         self._source = source
         self._entries = np.empty((0, 2), np.int64)
@@ -186,7 +185,7 @@ class _Table:
 
     def pairs(self, num_events: int, num_outside: int) -> EventPairs:
         """Return the pairs of all events that were added."""
-        unusable, first, merged, refractory = (int(count) for count in self._counts)
+        unusable, first, merged, refractory = self._counts.tolist()
         num_rows = num_events - num_outside - unusable - merged
         if num_rows == 0:
             raise DataError(self._source, "no event lies on a pixel with a direction", "check the lens's distortion")
@@ -207,7 +206,7 @@ class _Table:
         if block_ends[-1] < 0:
             remedy = "check the unit of the times, or choose a shorter time window"
             raise DataError(self._source, "its intervals add up to more than 292 years", remedy)
-        width, height = self._shape
+        height, width = self._shape
         return EventPairs(
             rows=rows,
             replacement_rows=num_pairs + np.flatnonzero(is_pair(rows[num_pairs:num_rows, 1])),
