@@ -63,7 +63,7 @@ def _is_known(kind: str, name: str) -> bool:
     """Tell whether a tag makes nothing but an object of a known class."""
     if (kind == "python/object/apply" and name in _CALLED) or (kind == "python/name" and name in _FUNCTIONS):
         return True
-    found = _find(name) if name.startswith(_PACKAGES) else None
+    found = _find(name)
     # A module of a known package may have imported a class of another one.
     if not isinstance(found, type) or not f"{found.__module__}.".startswith(_PACKAGES):
         return False
@@ -80,7 +80,7 @@ def _is_member(events: list[yaml.Event]) -> bool:
     if isinstance(owner, yaml.AliasEvent):
         owner = next(event for event in events if getattr(event, "anchor", None) == owner.anchor)
     kind, name = _split(owner)
-    found = _find(name) if name.startswith(_PACKAGES) else None
+    found = _find(name)
     return (
         kind == "python/name"
         and isinstance(found, enum.EnumMeta)
@@ -97,9 +97,9 @@ def _split(event: yaml.Event) -> tuple[str, str]:
 
 
 def _find(name: str) -> Any:
-    """Import what a dotted name of a known package stands for, or return None."""
+    """Import what a dotted name stands for, or return None where no known package has it."""
     module, _, attribute = name.rpartition(".")
     try:
-        return getattr(importlib.import_module(module), attribute, None)
+        return getattr(importlib.import_module(module), attribute, None) if name.startswith(_PACKAGES) else None
     except ImportError:
         return None
