@@ -90,13 +90,11 @@ def striped_wallpaper(size: int, rng: np.random.Generator, colors: Sequence[str]
     return albedo(paper, 0.05 * spectral_noise(size, rng, 1.0))
 
 
-def leafy_wallpaper(
-    size: int, rng: np.random.Generator, ground: str, colors: Sequence[str], sprigs: int = 110
-) -> Texture:
+def leafy_wallpaper(size: int, rng: np.random.Generator, ground: str, colors: Sequence[str]) -> Texture:
     """Strew leaves of several colors over a mottled ground."""
-    paper = _blend([ground, ground], np.zeros((size, size)))
+    paper = np.full((size, size, 3), linear_color(ground))
     u, v = _coordinate(size)[None, :], _coordinate(size)[:, None]
-    for _ in range(sprigs):
+    for _ in range(110):
         angle, length = rng.uniform(0, 2 * np.pi), rng.uniform(0.035, 0.075)
         du, dv = (u - rng.random() + 0.5) % 1 - 0.5, (v - rng.random() + 0.5) % 1 - 0.5
         along, across = du * np.cos(angle) + dv * np.sin(angle), dv * np.cos(angle) - du * np.sin(angle)
@@ -115,10 +113,10 @@ def checker(size: int, rng: np.random.Generator, colors: Sequence[str], cells: i
     return albedo(_blend(colors, 0.5 + squares), 0.06 * spectral_noise(size, rng, 1.0))
 
 
-def fabric(size: int, rng: np.random.Generator, colors: Sequence[str], threads: int = 24) -> Texture:
+def fabric(size: int, rng: np.random.Generator, colors: Sequence[str]) -> Texture:
     """Make a plain weave with uneven threads and a wide check."""
     coordinate = _coordinate(size)
-    wave = np.sin(2 * np.pi * threads * coordinate)
+    wave = np.sin(2 * np.pi * 24 * coordinate)
     check = np.sin(2 * np.pi * 2 * coordinate)
     tone = 0.5 + 0.10 * wave[None, :] * wave[:, None] + 0.16 * (check[None, :] + check[:, None])
     uneven = spectral_noise(size, rng, 0.9, (6.0, 1.0)) + spectral_noise(size, rng, 0.9, (1.0, 6.0))
@@ -165,11 +163,11 @@ def landscape(size: int, rng: np.random.Generator, sky: Sequence[str], hills: Se
     return albedo(picture, 0.05 * spectral_noise(size, rng, 0.8))
 
 
-def abstract(size: int, rng: np.random.Generator, ground: str, colors: Sequence[str], shapes: int = 16) -> Texture:
+def abstract(size: int, rng: np.random.Generator, ground: str, colors: Sequence[str]) -> Texture:
     """Paint overlapping discs and bars."""
     u, v = _coordinate(size)[None, :], _coordinate(size)[:, None]
-    picture = _blend([ground, ground], np.zeros((size, size)))
-    for shape in range(shapes):
+    picture = np.full((size, size, 3), linear_color(ground))
+    for shape in range(16):
         center, radius, angle = rng.uniform(0.15, 0.85, 2), rng.uniform(0.05, 0.2), rng.uniform(0, np.pi)
         du, dv = u - center[0], v - center[1]
         along, across = du * np.cos(angle) + dv * np.sin(angle), dv * np.cos(angle) - du * np.sin(angle)
