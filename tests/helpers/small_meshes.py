@@ -53,11 +53,10 @@ def plate(half: float, picture: np.ndarray | None = None, tiles: float = 1.0) ->
 
 
 def joined(*meshes: Mesh) -> Mesh:
-    first = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes)])
-    faces = np.concatenate([mesh.faces + start for mesh, start in zip(meshes, first, strict=False)])
-    names = ("vertices", "uv", "color", "texture", "emission", "gloss")
+    vertices, faces = trimesh.util.append_faces([mesh.vertices for mesh in meshes], [mesh.faces for mesh in meshes])
+    names = ("uv", "color", "texture", "emission", "gloss")
     parts = {name: np.concatenate([getattr(mesh, name) for mesh in meshes]) for name in names}
-    return Mesh(faces=faces, textures=(), **parts)
+    return Mesh(vertices, faces, textures=(), **parts)
 
 
 def ray_directions(intrinsics: tuple[float, ...], width: int, height: int) -> np.ndarray:

@@ -135,16 +135,14 @@ def _build_mesh(path: Path, content: bytes, y_up: bool, gloss: Mapping[str, Glos
     textures: dict[int, Texture] = {}
     parts = [_build_part(path, mesh, transform, suffix == ".glb", textures) for mesh, transform in placed]
     vertices, faces, uv, color, texture = zip(*parts, strict=True)
-    first = np.cumsum([0, *map(len, vertices)])
-    world = np.concatenate(vertices)
+    world, joined = trimesh.util.append_faces(vertices, faces)
     if y_up:
         world = np.stack([world[:, 0], -world[:, 2], world[:, 1]], axis=1)
-    joined = np.concatenate([part + start for part, start in zip(faces, first, strict=False)])
     if not np.isfinite(world[joined]).all():
         raise DataError(path, "vertices that are not finite", _REMEDY)
     return Mesh(
         world,
-        joined,
+        joined.astype(np.int64),
         np.concatenate(uv),
         np.concatenate(color),
         np.concatenate(texture),
