@@ -56,7 +56,7 @@ def frame_displacement(
 
 
 def frame_parameters(
-    scene: SimulationScene, intrinsics: Sequence[float], width: int, height: int, max_displacement: float = 0.5
+    scene: SimulationScene, intrinsics: Sequence[float], width: int, height: int, max_displacement: float
 ) -> Array:
     """Return path parameters (N,), 0 to 1, between which 99 % of the picture moves at most ``max_displacement``.
 

@@ -28,7 +28,7 @@ _COATS = {
 """Coats of the shiny locomotive, by the textures that they cover. Gravel, wood and coal are diffuse."""
 
 
-def locomotive_scene(seed: int = 0, *, shiny: bool = False) -> Renderer:
+def locomotive_scene(seed: int, *, shiny: bool) -> Renderer:
     """Build and light the locomotive, in front of gray. The seed moves the patterns of the textures.
 
     If ``shiny``, its paint is varnished and its metal polished. Highlights clip at a radiance of 1.

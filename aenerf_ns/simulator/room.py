@@ -21,7 +21,7 @@ HEIGHT = 2.5
 BOOK_COLORS = ("b5523b", "d9a441", "4f7a5b", "3f6d8e", "8c4a6b", "e0d3b0", "6b7f3a", "c9772e", "5a5fa0", "a8463f")
 
 
-def room_scene(seed: int = 0) -> Renderer:
+def room_scene(seed: int) -> Renderer:
     """Furnish and light the room. The seed moves the patterns of the textures, and which book stands where."""
     rng = np.random.default_rng(seed)
     shapes = [*_shell(), *_window(), *_pictures(), *_table(), *_bookshelf(rng), *_sofa(), *_cabinet(), *_corners()]
