@@ -23,7 +23,7 @@ from aenerf_ns.simulator.rendering.embree import NOTHING, RayCaster
 from aenerf_ns.simulator.rendering.environment import row_weights, split
 from aenerf_ns.simulator.rendering.mesh import Mesh, normals_and_areas, position_ids
 from aenerf_ns.simulator.rendering.mip_maps import lookup, mip_maps, panorama
-from aenerf_ns.simulator.rendering.reflections import make_reflections
+from aenerf_ns.simulator.rendering.reflections import hit_weights, make_reflections
 from aenerf_ns.simulator.rendering.renderer import Renderer, make_surroundings
 from aenerf_ns.simulator.rendering.surface import Surface, face_normal, make_surface
 from aenerf_ns.simulator.rendering.vectors import dot, length, row
@@ -37,6 +37,8 @@ _SUN_SAMPLES = 32
 _BOUNCES = 12
 _SMOOTHING = 4
 _CHUNK = 1 << 14
+_R2_STEP = np.array([0.7548776662466927, 0.5698402909980532])
+"""Of the R2 low-discrepancy sequence in the unit square (Roberts, 2018): 1 / p and 1 / p^2 of the plastic number p."""
 
 
 class AreaLight(NamedTuple):
@@ -142,8 +144,7 @@ def light_mesh(
     Light that a glossy face passes on to other faces is computed as if the face were diffuse.
 
     Args:
-        mesh: its light is computed at the corners of its faces and is linear between them.
-        caster: casts rays against the mesh.
+        mesh, caster: the mesh, and what casts rays against it.
         environment, lamps: the light.
         background: (3,) radiance where a camera's ray hits nothing, unless the environment is shown there.
         show_environment: whether the camera sees the environment where its ray hits nothing.
@@ -162,13 +163,13 @@ def light_mesh(
     if mesh.gloss[:, 0].any():
         gloss = make_reflections(mesh, points.corner, points.normal, emitters, make_surroundings(environment), ambient)
     shown = make_surroundings(environment if show_environment else None)
-    return Renderer(surface, caster, light, background, shown, math.inf, gloss)
+    return Renderer(surface, caster, light, background, shown, reflections=gloss)
 
 
 def baked_mesh(mesh: Mesh, caster: RayCaster, background: Array) -> Renderer:
     """Return a renderer of a mesh whose colors are radiance, in front of a uniform background (3,)."""
     surface, light = make_surface(mesh, np.zeros_like(mesh.faces)), np.ones((2, 1, 3), np.float32)
-    return Renderer(surface, caster, light, background, make_surroundings(None), math.inf, None)
+    return Renderer(surface, caster, light, background, make_surroundings(None))
 
 
 def compute_light(
@@ -189,9 +190,7 @@ def compute_light(
     even, bright = split(environment)
     sky = mip_maps([even], bits16=False)
     sun = _Sun(bright, 8.0 * float(np.abs(surface.vertices).max())) if bright.max() > 0 else None
-    # The first points of the R2 low-discrepancy sequence in the unit square (Roberts, 2018), of the plastic number.
-    plastic = 1.32471795724474602596
-    directions = (np.arange(1, _DIRECTIONS + 1)[:, None] * np.array([1 / plastic, 1 / plastic**2])) % 1.0
+    directions = (np.arange(1, _DIRECTIONS + 1)[:, None] * _R2_STEP) % 1.0
 
     sharp = np.zeros((2 * count, 3), np.float32)
     sky_light = np.zeros((2 * count, 3), np.float32)
@@ -224,8 +223,7 @@ def compute_light(
     for _ in range(_BOUNCES):
         light = direct + (gathering @ (albedo * light) / _DIRECTIONS).astype(np.float32)
     sides = [np.stack([points.corner[:, i], points.corner[:, i - 1]], axis=1) for i in range(3)]
-    light = _smooth(light, sharp, buried, np.unique(np.concatenate(sides), axis=0))
-    return np.ascontiguousarray(light.reshape(2, count, 3), np.float32)
+    return _smooth(light, sharp, buried, np.unique(np.concatenate(sides), axis=0)).reshape(2, count, 3)
 
 
 def _smooth(
@@ -343,9 +341,9 @@ class _Sun:
         index = np.searchsorted(self._cumulative, ((rank + jitter[:, :1]) / _SUN_SAMPLES).reshape(-1))
         index = np.minimum(index, len(self._texel) - 1)
         texel = self._texel[index]
-        # An additive recurrence spreads the samples evenly over each texel.
-        u = ((rank * 0.7548776662466927 + jitter[:, 1:]) % 1).reshape(-1)
-        v = ((rank * 0.5698402909980532 + jitter[:, :1]) % 1).reshape(-1)
+        # The sequence spreads the samples evenly over each texel.
+        u = ((rank * _R2_STEP[0] + jitter[:, 1:]) % 1).reshape(-1)
+        v = ((rank * _R2_STEP[1] + jitter[:, :1]) % 1).reshape(-1)
         # Uniform in solid angle: the height is uniform between the texel's edges.
         row = texel // columns
         top, bottom = np.cos(np.pi * row / rows), np.cos(np.pi * (row + 1) / rows)
@@ -401,10 +399,8 @@ def _gather(surface, half, rays, hits, size, sky, links, received, buried, begin
                 blue += b
                 continue
             facing = dot(direction, face_normal(surface, face))
-            second_weight, third_weight = hits.coordinates[i, 0], hits.coordinates[i, 1]
-            nearest = 0
-            if max(second_weight, third_weight) > 1.0 - second_weight - third_weight:
-                nearest = 1 if second_weight >= third_weight else 2
+            first, second, third = hit_weights(hits, i)
+            nearest = 0 if first >= max(second, third) else (1 if second >= third else 2)
             links[n, k] = surface.light_point[face, nearest] + (half if facing > 0.0 else 0)
             behind += facing > 0.0
             near += hits.distance[i] < size[n]

@@ -88,8 +88,8 @@ class Renderer:
     light: NDArray[np.float32]
     background: Array
     surroundings: MipMaps
-    limit: float
-    reflections: Reflections | None
+    limit: float = math.inf
+    reflections: Reflections | None = None
     gain: float = 1.0
 
     def render(
