@@ -160,7 +160,5 @@ class TrackAdjustment:
 def _sum_by(index: NDArray[np.int64], values: Array, size: int) -> Array:
     """Add up the values (M, ...) of each index (M,), as an array (size, ...)."""
     flat = values.reshape(len(values), -1)
-    sums = np.zeros((size, flat.shape[1]))
-    for column in range(flat.shape[1]):
-        sums[:, column] = np.bincount(index, flat[:, column], size)
+    sums: Array = np.stack([np.bincount(index, column, size) for column in flat.T], 1)
     return sums.reshape(size, *values.shape[1:])
