@@ -161,9 +161,8 @@ def estimate_poses(
     times = np.asarray(times, np.int64)
     if len(times) < 3:
         raise DataError(source, f"{len(times)} frames", "poses can be estimated from three frames or more")
-    if (np.diff(times) <= 0).any():
-        index = int(np.argmax(np.diff(times) <= 0)) + 1
-        raise DataError(source, f"frame {index} is not after the frame before it", "sort the frames by time")
+    if len(backward := np.flatnonzero(np.diff(times) <= 0)):
+        raise DataError(source, f"frame {backward[0] + 1} is not after the frame before it", "sort the frames by time")
     begin = time.perf_counter()
     given = camera if isinstance(camera, CameraIntrinsics) else None
     size = (camera.width, camera.height) if isinstance(camera, CameraIntrinsics) else camera
@@ -183,12 +182,10 @@ def estimate_poses(
         )
     model = models[0]
     stand_upright(model)
-    if given is None:
-        given = intrinsics_of(model)
     return EstimatedPoses(
         frame_times=times,
         trajectory=trajectory_of(model, times, source),
-        camera=given,
+        camera=given or intrinsics_of(model),
         model_sizes=[model.num_reg_images() for model in models],
         num_points=model.num_points3D(),
         reprojection_error=model.compute_mean_reprojection_error(),
