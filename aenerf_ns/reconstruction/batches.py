@@ -65,7 +65,6 @@ def normalize(grid: NDArray[np.float32]) -> NDArray[np.float32]:
     if not active.any():
         return grid
     values = grid[active].astype(np.float64)
-    deviation = values.std()
     result = np.zeros_like(grid)
-    result[active] = (values - values.mean()) / (deviation if deviation > 0 else 1.0)
+    result[active] = (values - values.mean()) / (values.std() or 1.0)
     return result

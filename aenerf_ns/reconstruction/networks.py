@@ -151,11 +151,7 @@ class FireNet(nn.Module):
     """The network of the weights file firenet_1000.pth.tar (Scheerlinck et al., WACV 2020).
 
     A convolution and two residual blocks of 16 channels at full resolution. A convolutional GRU follows the convolution
-    and the first block.
-
-    Attributes:
-        name_in_file: see :class:`E2VID`.
-        multiple: see :class:`E2VID`.
+    and the first block. For its attributes see :class:`E2VID`.
     """
 
     name_in_file = "net"

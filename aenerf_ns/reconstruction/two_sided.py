@@ -52,8 +52,7 @@ def log_intensities(
     # The latest batches whose images wait for what follows: as many again are yielded at a time.
     num_ahead = 0
     for batch in batches:
-        if forward is None:
-            forward = filter_of(batch)
+        forward = forward or filter_of(batch)
         forward.add(batch)
         held.append((batch, forward.state(), forward.weight))
         num_ahead = min(math.ceil(_LOOK_AHEAD * batch.width * batch.height / len(batch)), _MAX_IMAGES_AHEAD)
@@ -70,8 +69,7 @@ def _finish(
     both: list[tuple[int, NDArray[np.float32]]] = []
     backward: _Filter | None = None
     for batch, state, weight in reversed(held):
-        if backward is None:
-            backward = filter_of(batch)
+        backward = backward or filter_of(batch)
         mean = (weight * state + backward.weight * backward.state()) / (weight + backward.weight)
         # An image of a batch shorter than the lag is dated to the batch's start.
         lag = round(_LAG * batch.width * batch.height)
