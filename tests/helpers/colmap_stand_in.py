@@ -1,8 +1,11 @@
-"""A stand-in for COLMAP in tests of commands. COLMAP itself is tested elsewhere."""
+"""Stand-ins for COLMAP, in tests of commands, and for its models. COLMAP itself is tested elsewhere."""
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
+import pycolmap
 import pytest
 import torch
 
@@ -11,6 +14,21 @@ from aenerf_ns.camera.trajectory import Trajectory
 from aenerf_ns.pose_estimation.from_frames import EstimatedPoses
 
 FOUND_BOX = torch.tensor([[-1.0, -2.0, -3.0], [1.0, 2.0, 3.0]], dtype=torch.float64)
+
+
+def model_of(*seen: range) -> SimpleNamespace:
+    """A model of frames that see ranges of points."""
+    images = {
+        index: SimpleNamespace(
+            name=f"{index:08d}.png",
+            has_pose=True,
+            num_points3D=len(points),
+            points2D=[SimpleNamespace(point3D_id=point, has_point3D=lambda: True) for point in points],
+            cam_from_world=pycolmap.Rigid3d,
+        )
+        for index, points in enumerate(seen)
+    }
+    return SimpleNamespace(images=images)
 
 
 def place_frames(num_placed: int, monkeypatch: pytest.MonkeyPatch) -> None:

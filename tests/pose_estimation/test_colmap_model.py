@@ -2,29 +2,13 @@
 
 from __future__ import annotations
 
-from types import SimpleNamespace
-
 import numpy as np
 import pycolmap
 import pytest
+from helpers.colmap_stand_in import model_of
 from scipy.spatial.transform import Rotation
 
 from aenerf_ns.pose_estimation.colmap_model import is_sound, poses_of, stand_upright
-
-
-def model_of(*seen: range) -> SimpleNamespace:
-    """A model of frames that see ranges of points."""
-    images = {
-        index: SimpleNamespace(
-            name=f"{index:08d}.png",
-            has_pose=True,
-            num_points3D=len(points),
-            points2D=[SimpleNamespace(point3D_id=point, has_point3D=lambda: True) for point in points],
-            cam_from_world=lambda: pycolmap.Rigid3d(np.eye(4)[:3]),
-        )
-        for index, points in enumerate(seen)
-    }
-    return SimpleNamespace(images=images)
 
 
 def test_frames_that_see_few_points_have_no_pose() -> None:

@@ -7,6 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pycolmap
 import pytest
+from helpers.colmap_stand_in import model_of
 
 from aenerf_ns.pose_estimation.scene_box import box_of
 from aenerf_ns.simulator.paths import look_at
@@ -21,27 +22,19 @@ def model(
     """
     angles = np.linspace(0, turn, 20)
     poses = [look_at((radius * np.cos(a), radius * np.sin(a), 0.4), (0.0, 0.0, 0.0))[:3] for a in angles]
-    images = {
-        index: SimpleNamespace(
-            name=f"{index}.png",
-            has_pose=True,
-            num_points3D=num_seen,
-            points2D=[SimpleNamespace(point3D_id=point, has_point3D=lambda: True) for point in range(100)],
-            cam_from_world=pycolmap.Rigid3d(pose).inverse,
-        )
-        for index, pose in enumerate(poses)
-    }
-    # A camera without a place of its own, within the cube.
-    images[20] = SimpleNamespace(name="20.png", has_pose=True, num_points3D=5, cam_from_world=pycolmap.Rigid3d)
+    # The last camera has no place of its own, within the cube.
+    made = model_of(*[range(num_seen)] * 20, range(5))
+    for index, pose in enumerate(poses):
+        made.images[index].cam_from_world = pycolmap.Rigid3d(pose).inverse
     positions = np.random.default_rng(0).uniform(-1, 1, (num_points, 3))
     positions[:num_wrong] *= 100
-    points = {
+    made.points3D = {
         index: SimpleNamespace(
             xyz=xyz, track=SimpleNamespace(length=lambda index=index: 3 if index < num_wrong else 10)
         )
         for index, xyz in enumerate(positions)
     }
-    return SimpleNamespace(images=images, points3D=points)
+    return made
 
 
 @pytest.mark.parametrize("num_wrong", [0, 200])
