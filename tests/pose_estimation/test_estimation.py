@@ -44,6 +44,7 @@ from aenerf_ns.simulator.scene import SimulationScene
 from aenerf_ns.simulator.simulation import Simulation
 
 FRAME = 40_000_000
+SMALL = CameraIntrinsics(80, 60, 70.0, 70.0, 40.0, 30.0)
 
 
 class FirstSeventh(RoomPath):
@@ -325,25 +326,24 @@ def test_draw_tracks_and_paths() -> None:
 def test_refuse_frames_without_texture() -> None:
     frames = np.full((4, 60, 80), 128, np.uint8)
     with pytest.raises(DataError, match=r"^flat: COLMAP places none of 4 frames: they have 0 .*; .*textured"):
-        estimate_poses(frames, np.arange(4) * FRAME, CameraIntrinsics(80, 60, 70.0, 70.0, 40.0, 30.0), "flat")
+        estimate_poses(frames, np.arange(4) * FRAME, SMALL, "flat")
 
 
 def test_refuse_unusable_frames(tmp_path: Path) -> None:
-    camera = CameraIntrinsics(80, 60, 70.0, 70.0, 40.0, 30.0)
     frames = np.full((3, 60, 80), 128, np.uint8)
     for times, text in (([0, 1], "2 frames"), ([5, 5, 6], "frame 1 is not after")):
         with pytest.raises(DataError, match=text):
-            estimate_poses(frames, times, camera, "video")
+            estimate_poses(frames, times, SMALL, "video")
     with pytest.raises(DataError, match="video, frame 0: the frame has 60 x 80 pixels"):
-        estimate_poses(frames.transpose(0, 2, 1), [0, 1, 2], camera, "video")
+        estimate_poses(frames.transpose(0, 2, 1), [0, 1, 2], SMALL, "video")
     Image.fromarray(frames[0].astype(np.uint16)).save(tmp_path / "deep.png")
     with pytest.raises(DataError, match=r"deep\.png: .*mode I;16"):
-        estimate_poses([tmp_path / "deep.png"] * 3, [0, 1, 2], camera, "video")
+        estimate_poses([tmp_path / "deep.png"] * 3, [0, 1, 2], SMALL, "video")
     whole, cut = tmp_path / "whole.png", tmp_path / "cut.png"
     Image.fromarray(np.random.default_rng(0).integers(0, 256, (60, 80), np.uint8)).save(whole)
     cut.write_bytes(whole.read_bytes()[:-100])
     with pytest.raises(DataError, match=r"cut\.png: not a PNG or JPEG image"):
-        estimate_poses([whole, cut, whole], [0, 1, 2], camera, "video")
+        estimate_poses([whole, cut, whole], [0, 1, 2], SMALL, "video")
 
 
 @pytest.mark.parametrize("pattern", ["", "RGGB"])
@@ -432,8 +432,7 @@ def test_align_all_frames_without_majority(truth: torch.Tensor) -> None:
 
 def test_report_lost_frames_and_fragments(truth: torch.Tensor) -> None:
     times = FRAME * np.arange(10)
-    camera = CameraIntrinsics(80, 60, 70.0, 70.0, 40.0, 30.0)
-    found = EstimatedPoses(times, Trajectory(times[[1, 2, 5, 6, 8]], truth[:5]), camera, [5, 3], 100, 0.5, 200.0, 1.0)
+    found = EstimatedPoses(times, Trajectory(times[[1, 2, 5, 6, 8]], truth[:5]), SMALL, [5, 3], 100, 0.5, 200.0, 1.0)
     assert found.gaps() == [(0, 0, 1), (3 * FRAME, 4 * FRAME, 2), (7 * FRAME, 7 * FRAME, 1), (9 * FRAME, 9 * FRAME, 1)]
     report = found.report()
     assert json.loads(json.dumps(report)) == report
