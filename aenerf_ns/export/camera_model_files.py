@@ -76,16 +76,13 @@ def _write_colmap_model(folder: Path, images: Sequence[PlacedImage], points: Obs
         pycolmap.Camera(camera_id=1, model=name, width=camera.width, height=camera.height, params=parameters)
     )
     for index, image in enumerate(images):
-        keypoints = points.pixels[points.images == index]
+        seen = points.images == index
         model.add_image_with_trivial_frame(
-            pycolmap.Image(name=image.name, keypoints=keypoints, camera_id=1, image_id=index + 1),
+            pycolmap.Image(name=image.name, keypoints=points.pixels[seen], camera_id=1, image_id=index + 1),
             pycolmap.Rigid3d(np.linalg.inv(image.camera_to_world)[:3]),
         )
-    num_earlier = np.zeros(len(images), np.int64)
-    for position, color, index in zip(points.positions, points.colors, points.images, strict=True):
-        element = pycolmap.TrackElement(int(index) + 1, int(num_earlier[index]))
-        num_earlier[index] += 1
-        model.add_point3D(position, pycolmap.Track([element]), color)
+        for row, (position, color) in enumerate(zip(points.positions[seen], points.colors[seen], strict=True)):
+            model.add_point3D(position, pycolmap.Track([pycolmap.TrackElement(index + 1, row)]), color)
     sparse = folder / SPARSE_FOLDER
     sparse.mkdir(parents=True)
     model.write(str(sparse))
