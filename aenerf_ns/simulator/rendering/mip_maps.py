@@ -27,12 +27,14 @@ def mip_maps(pictures: Sequence[NDArray[np.float32]], bits16: bool) -> MipMaps:
 
     With ``bits16``, values are stored as 16-bit integers, clipped to [0, 1], which halves the memory.
     """
-    texels, level, first_level, start = [], [], [0], 0
+    kind = np.uint16 if bits16 else np.float32
+    texels: list[NDArray] = [np.zeros((0, 3), kind)]
+    level, first_level, start = [], [0], 0
     for picture in pictures:
         while True:
             rows, columns = picture.shape[:2]
-            stored = np.rint(picture.clip(0, 1) * 65535).astype(np.uint16) if bits16 else picture.astype(np.float32)
-            texels.append(stored.reshape(-1, 3))
+            stored = np.rint(picture.clip(0, 1) * 65535) if bits16 else picture
+            texels.append(stored.astype(kind).reshape(-1, 3))
             level.append((start, rows, columns))
             start += rows * columns
             if rows == columns == 1:
@@ -41,11 +43,7 @@ def mip_maps(pictures: Sequence[NDArray[np.float32]], bits16: bool) -> MipMaps:
             halved = cv2.resize(picture, half, interpolation=cv2.INTER_AREA)
             picture = np.asarray(halved, np.float32).reshape(half[1], half[0], -1)
         first_level.append(len(level))
-    return MipMaps(
-        np.concatenate(texels) if texels else np.zeros((0, 3), np.uint16 if bits16 else np.float32),
-        np.array(level, np.int64).reshape(-1, 3),
-        np.array(first_level, np.int64),
-    )
+    return MipMaps(np.concatenate(texels), np.array(level, np.int64).reshape(-1, 3), np.array(first_level, np.int64))
 
 
 @numba.njit(cache=True, error_model="numpy")
