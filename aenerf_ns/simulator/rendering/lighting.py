@@ -64,14 +64,13 @@ def light_points(mesh: Mesh) -> LightPoints:
 
     At the boundary of a surface, points lie a little inside it, away from other surfaces that begin there.
     """
-    a, b, c = mesh.vertices[mesh.faces.T]
+    corners = mesh.vertices[mesh.faces]
     normals, _ = normals_and_areas(mesh)
     position_id = position_ids(mesh.vertices)[mesh.faces].reshape(-1)
     order = np.argsort(position_id, kind="stable")
     start = np.searchsorted(position_id[order], np.arange(position_id.max() + 2))
     corner = np.empty(len(position_id), np.int64)
     count = _smooth_parts(start, order, normals, corner)
-    corners = np.stack([a, b, c], axis=1)
     towards, back = np.roll(corners, -1, axis=1) - corners, np.roll(corners, 1, axis=1) - corners
     lengths = np.linalg.norm(towards, axis=-1)
     cosine = (towards * back).sum(-1) / np.maximum(lengths * np.linalg.norm(back, axis=-1), 1e-300)
