@@ -250,8 +250,7 @@ def test_refine_given_poses(
     dataset: Path, tmp_path: Path, degrees: float, offset: int, images: str, request: pytest.FixtureRequest
 ) -> None:
     weights = request.getfixturevalue("firenet_weights") if images == "network" else None
-    given = tmp_path / "given"
-    shutil.copytree(dataset, given)
+    given = shutil.copytree(dataset, tmp_path / "given")
     truth = read_tum_trajectory(given / "trajectory_ground_truth.txt")
     noisy = perturb(truth, degrees, degrees * 0.03, 0.15, seed=2)
     late = Trajectory(noisy.times + offset, noisy.camera_to_worlds)
@@ -278,8 +277,7 @@ def test_refuse_too_few_events_and_poses_beside_them(bare: Path, dataset: Path, 
     message = r"its events make . images"
     with pytest.raises(DataError, match=message):
         Convert(bare, output=tmp_path / "scene", poses="events", end_time_ns=10_000_000).main()
-    given = tmp_path / "given"
-    shutil.copytree(dataset, given)
+    given = shutil.copytree(dataset, tmp_path / "given")
     truth = read_tum_trajectory(given / "trajectory_ground_truth.txt")
     first = truth.times < truth.start + 20_000_000
     cut = Trajectory(truth.times[first], truth.camera_to_worlds[first])

@@ -80,23 +80,21 @@ def test_gradient_and_hessian_are_those_of_the_cost(truth: np.ndarray) -> None:
     generator = np.random.default_rng(1)
     direction = generator.normal(size=(COUNT, 6))
 
-    def gradient(step: float) -> np.ndarray:
-        adjustment = TrackAdjustment(tracks, 0)
-        poses = move_poses(given, step * direction)
+    def adjusted(step: float) -> tuple[TrackAdjustment, np.ndarray]:
+        adjustment, poses = TrackAdjustment(tracks, 0), move_poses(given, step * direction)
         adjustment.adjust_points(poses, 30)
-        return adjustment.linearize(poses)[1].sum(0)
+        return adjustment, poses
 
     def cost(step: float) -> float:
-        adjustment = TrackAdjustment(tracks, 0)
-        poses = move_poses(given, step * direction)
-        adjustment.adjust_points(poses, 30)
+        adjustment, poses = adjusted(step)
         positions = adjustment.positions[tracks.points]
         local = np.einsum("mji,mj->mi", poses[tracks.images, :, :3], positions - poses[tracks.images, :, 3])
         squares = np.square(FOCAL * (local[:, :2] / local[:, 2:] - tracks.rays)).sum(1)
         return 0.5 * np.log1p(squares).sum()
 
     slope = (cost(1e-5) - cost(-1e-5)) / 2e-5
-    assert gradient(0.0) @ direction.ravel() == pytest.approx(slope, rel=1e-3)
+    adjustment, poses = adjusted(0.0)
+    assert adjustment.linearize(poses)[1].sum(0) @ direction.ravel() == pytest.approx(slope, rel=1e-3)
     # At the true poses the errors are zero, and Gauss and Newton's Hessian is exact.
     exact = TrackAdjustment(tracks_of(truth, 0.0, truth), 0)
     exact.adjust_points(truth, 5)
