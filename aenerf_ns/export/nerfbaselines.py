@@ -83,11 +83,7 @@ def write_predictions(
     for name, rendering, truth in views:
         rendering.save(folder / _RENDERED / f"{name}.png")
         truth.save(folder / _TRUE / f"{name}.png")
-    rendered = {
-        "render_version": _version(),
-        "render_datetime": _now(),
-        "render_dataset_metadata": info["dataset_metadata"],
-    }
+    rendered = {**_stamp("render"), "render_dataset_metadata": info["dataset_metadata"]}
     (folder / "info.json").write_text(json.dumps({**info, **rendered}, indent=2) + "\n", "utf8")
 
 
@@ -102,12 +98,10 @@ def write_results(
         name: base64.b64encode(np.asarray(values, "<f4").tobytes()).decode("ascii") for name, values in metrics.items()
     }
     results = {
-        "render_version": _version(),
-        "render_datetime": _now(),
+        **_stamp("render"),
         "render_dataset_metadata": info["dataset_metadata"],
         "nb_info": info,
-        "evaluate_version": _version(),
-        "evaluate_datetime": _now(),
+        **_stamp("evaluate"),
         "metrics": {name: round(float(np.mean(values)), _DIGITS) for name, values in metrics.items()},
         "metrics_raw": encoded,
         "metrics_sha256": _hash_of_metrics(metrics),
@@ -118,12 +112,10 @@ def write_results(
     path.write_text(json.dumps(results, indent=2) + "\n", "utf8")
 
 
-def _version() -> str:
-    return f"aenerf-ns {version('aenerf-ns')}"
-
-
-def _now() -> str:
-    return datetime.now(timezone.utc).replace(tzinfo=None).isoformat(timespec="seconds")
+def _stamp(stage: str) -> dict[str, str]:
+    """Return the program and the time of a stage: "render" or "evaluate"."""
+    now = datetime.now(timezone.utc).replace(tzinfo=None).isoformat(timespec="seconds")
+    return {f"{stage}_version": f"aenerf-ns {version('aenerf-ns')}", f"{stage}_datetime": now}
 
 
 def _hash_of_files(folder: Path) -> str:
