@@ -46,8 +46,7 @@ def test_first_of_coincident_faces_is_seen() -> None:
 def test_degenerate_faces_are_dropped() -> None:
     square = plate(1.0)
     faces = np.concatenate([square.faces, [[0, 0, 1], [0, 2, 2]]])
-    rest = {"texture": np.full(4, -1), "emission": np.zeros(4), "gloss": np.zeros((4, 2))}
-    mesh, _ = repair(dataclasses.replace(square, faces=faces, **rest), 10.0)
+    mesh, _ = repair(dataclasses.replace(square.with_faces_kept([0, 1, 0, 1]), faces=faces), 10.0)
     assert len(mesh.faces) == 2
     with pytest.raises(ValueError, match="no face has an area"):
         repair(dataclasses.replace(square, faces=faces[2:]), 10.0)
