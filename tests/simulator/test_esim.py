@@ -84,18 +84,17 @@ def test_agrees_with_slow_reference(refractory: int) -> None:
     x, y, t, p = simulate(simulator, images[1:], times[1:])
     log_frames = log_of(images)
     total = 0
-    for row in range(HEIGHT):
-        for column in range(WIDTH):
-            mine = (x == column) & (y == row)
-            here = (row, column)
-            expected = reference_events(
-                log_frames[:, row, column], times, positive[here], negative[here], refractory, int(starts[here])
-            )
-            np.testing.assert_allclose(t[mine], [time for time, _ in expected], atol=1, rtol=0)
-            np.testing.assert_array_equal(p[mine], [polarity for _, polarity in expected])
-            if refractory:
-                assert np.all(np.diff(t[mine]) > refractory)
-            total += len(expected)
+    for row, column in np.ndindex(HEIGHT, WIDTH):
+        mine = (x == column) & (y == row)
+        here = (row, column)
+        expected = reference_events(
+            log_frames[:, row, column], times, positive[here], negative[here], refractory, int(starts[here])
+        )
+        np.testing.assert_allclose(t[mine], [time for time, _ in expected], atol=1, rtol=0)
+        np.testing.assert_array_equal(p[mine], [polarity for _, polarity in expected])
+        if refractory:
+            assert np.all(np.diff(t[mine]) > refractory)
+        total += len(expected)
     assert total == len(t) > 100
     assert (x.dtype, y.dtype, t.dtype, p.dtype) == (np.uint16, np.uint16, np.int64, np.int8)
 
@@ -195,16 +194,15 @@ def test_shot_noise_moves_the_reference(refractory: int) -> None:
     x, y, t, p = simulate(simulator, images, times)
     signal = log_of(images)[:, 0, 0]
     noise = 0
-    for row in range(HEIGHT):
-        for column in range(WIDTH):
-            mine = (x == column) & (y == row)
-            change = np.interp(t[mine][1:], times, signal) - np.interp(t[mine][:-1] + refractory, times, signal)
-            regular = np.abs(change - np.where(p[mine][1:] > 0, 0.2, -0.3)) < 1e-6
-            # Whatever is not a threshold's step is noise, and never a larger step than a threshold.
-            assert (change[~regular] < 0.2).all()
-            assert (change[~regular] > -0.3).all()
-            assert (np.diff(t[mine]) > (refractory or -1)).all()
-            noise += (~regular).sum()
+    for row, column in np.ndindex(HEIGHT, WIDTH):
+        mine = (x == column) & (y == row)
+        change = np.interp(t[mine][1:], times, signal) - np.interp(t[mine][:-1] + refractory, times, signal)
+        regular = np.abs(change - np.where(p[mine][1:] > 0, 0.2, -0.3)) < 1e-6
+        # Whatever is not a threshold's step is noise, and never a larger step than a threshold.
+        assert (change[~regular] < 0.2).all()
+        assert (change[~regular] > -0.3).all()
+        assert (np.diff(t[mine]) > (refractory or -1)).all()
+        noise += (~regular).sum()
     expected = 8.0 * 0.8 * WIDTH * HEIGHT
     assert 0.1 * expected < noise < expected
     assert len(t) - noise > 3 * WIDTH * HEIGHT

@@ -67,15 +67,14 @@ def test_events_cross_thresholds(rising: bool) -> None:
     log_radiance = np.log(LEVELS[levels] + epsilon)
     threshold = 0.21 if rising else 0.17
     total = 0
-    for y in range(5):
-        for x in range(4):
-            change = np.abs(log_radiance[:, y, x] - log_radiance[0, y, x])
-            crossings = threshold * np.arange(1, int(change[-1] / threshold) + 1)
-            expected = np.interp(crossings, change, times)
-            mine = (events.x == x) & (events.y == y)
-            # Times are whole nanoseconds.
-            np.testing.assert_allclose(events.t[mine], expected, rtol=0, atol=0.6)
-            total += len(expected)
+    for y, x in np.ndindex(5, 4):
+        change = np.abs(log_radiance[:, y, x] - log_radiance[0, y, x])
+        crossings = threshold * np.arange(1, int(change[-1] / threshold) + 1)
+        expected = np.interp(crossings, change, times)
+        mine = (events.x == x) & (events.y == y)
+        # Times are whole nanoseconds.
+        np.testing.assert_allclose(events.t[mine], expected, rtol=0, atol=0.6)
+        total += len(expected)
     assert len(events) == total > 100
     assert set(events.p) == {1 if rising else -1}
 
