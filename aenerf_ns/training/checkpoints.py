@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 import warnings
 import zipfile
 from pathlib import Path
@@ -13,6 +14,7 @@ from aenerf_ns.errors import DataError
 
 # What a checkpoint of Nerfstudio's trainer holds at least.
 _ENTRIES = {"step", "pipeline", "optimizers", "schedulers", "scalers"}
+_OTHER_RUN = "give the folder of another run, or train again"
 
 
 def checkpoint_to_load(path: Path, step: int | None = None) -> Path:
@@ -25,10 +27,10 @@ def checkpoint_to_load(path: Path, step: int | None = None) -> Path:
     Raises:
         DataError: there is no such checkpoint, or it is broken.
     """
-    if path.suffix == ".ckpt" and path.is_file():
+    if path.suffix == ".ckpt" or (path.is_file() and path.name != "config.yml"):
         if step is not None and path.name != f"step-{step:09d}.ckpt":
             raise DataError(path, f"it is not the checkpoint of step {step}", "leave --load-step out")
-        require_whole(path)
+        _require_whole(path)
         return path
     folder = path.parent if path.name == "config.yml" and path.is_file() else path
     if not folder.is_dir():
@@ -37,7 +39,7 @@ def checkpoint_to_load(path: Path, step: int | None = None) -> Path:
         folder /= "nerfstudio_models"
     if step is not None:
         path = folder / f"step-{step:09d}.ckpt"
-        require_whole(path)
+        _require_whole(path)
         return path
     broken: list[str] = []
     for path in _newest_first(folder):
@@ -51,17 +53,20 @@ def checkpoint_to_load(path: Path, step: int | None = None) -> Path:
     problem = f"none of its checkpoints is whole: {'; '.join(broken)}" if broken else "it holds no checkpoint"
     # The folder of an experiment or of a method holds runs.
     below = next((path for depth in range(1, 4) for path in folder.glob("*/" * depth + "config.yml")), None)
-    remedy = "give the folder of another run, or train again" if below is None else f"give a run: {below.parent}"
+    remedy = _OTHER_RUN if below is None else f"give a run: {below.parent}"
     raise DataError(folder, problem, remedy)
 
 
-def require_whole(path: Path) -> None:
+def _require_whole(path: Path) -> None:
     """Raise a DataError that names the newest whole checkpoint beside a checkpoint, unless this one is whole."""
     fault = _fault(path)
     if fault is None:
         return
     whole = next((other for other in _newest_first(path.parent) if _fault(other) is None), None)
-    remedy = "train again" if whole is None else f"load {whole.name} (--load-step {step_of(whole)})"
+    remedy = _OTHER_RUN
+    if whole is not None:
+        # Both options, whichever named the broken one.
+        remedy = f"load {whole.name} (--load-dir {shlex.quote(str(whole.parent))} --load-step {step_of(whole)})"
     raise DataError(path, f"the checkpoint cannot be loaded ({fault})", remedy)
 
 

@@ -24,7 +24,7 @@ from nerfstudio.utils.decorators import check_main_thread
 from aenerf_ns.atomic_write import atomic_write
 from aenerf_ns.errors import DataError, errors_as_one_line
 from aenerf_ns.training import framework
-from aenerf_ns.training.checkpoints import checkpoint_to_load, require_whole, step_of
+from aenerf_ns.training.checkpoints import checkpoint_to_load, step_of
 from aenerf_ns.training.datamanager import EventDataManager
 from aenerf_ns.training.preflight import require_device
 from aenerf_ns.training.run_record import RunRecord, ScalarWriter
@@ -123,12 +123,14 @@ class AENeRFTrainer(Trainer):
         with errors_as_one_line():
             if length < 1:
                 raise DataError("ns-train", f"the schedules' length is {length} steps", "give one or more")
-            if config.load_dir is not None:
+            source = config.load_dir or config.load_checkpoint
+            if source is not None:
                 # As one path: commands that open this run would look for a load_step among its own checkpoints.
-                checkpoint = checkpoint_to_load(config.load_dir, config.load_step)
+                checkpoint = checkpoint_to_load(source, config.load_step)
                 changes |= {"load_checkpoint": checkpoint, "load_dir": None, "load_step": None}
-            elif config.load_checkpoint is not None:
-                require_whole(config.load_checkpoint)
+            elif config.load_step is not None:
+                problem = f"--load-step {config.load_step} names no run"
+                raise DataError("ns-train", problem, "give the run with --load-dir, too")
         self._record: RunRecord | None = None
         # The number of the signal that asked the training to stop, or 0.
         self._stopped_by = 0

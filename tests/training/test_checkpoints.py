@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import os
 import pickle
+import re
 import resource
 import shutil
 import signal
@@ -122,8 +123,11 @@ def test_a_broken_newest_checkpoint_is_named_and_passed_over(
     assert said.count("\n") == 1
     assert said.startswith(f"{folder}: broken checkpoints: {newest.name} (")
     assert said.endswith("). step-000000002.ckpt is loaded\n")
-    with pytest.raises(DataError, match=r"step-000000003.ckpt: .*; load step-000000002.ckpt \(--load-step 2\)"):
-        checkpoint_to_load(folder, 3)
+    # Both options: the broken one may have been named by either, or by --load-checkpoint.
+    remedy = re.escape(f"load step-000000002.ckpt (--load-dir '{folder}' --load-step 2)")
+    for path, step in ((folder, 3), (newest, None)):
+        with pytest.raises(DataError, match=f"step-000000003.ckpt: .*; {remedy}$"):
+            checkpoint_to_load(path, step)
     assert not (run / "executed").exists()
 
 
@@ -151,6 +155,10 @@ def test_what_lies_around_a_checkpoint_leads_to_it(run: Path, tmp_path: Path) ->
     assert checkpoint_to_load(folder / "step-000000002.ckpt") == folder / "step-000000002.ckpt"
     with pytest.raises(DataError, match="it is not the checkpoint of step 3"):
         checkpoint_to_load(folder / "step-000000002.ckpt", 3)
+    copied = shutil.copyfile(folder / "step-000000002.ckpt", run / "best.pth")
+    assert checkpoint_to_load(copied) == copied
+    with pytest.raises(DataError, match=r"step-5.ckpt: .*\(No such file or directory\); give the folder of another"):
+        checkpoint_to_load(run / "step-5.ckpt")
     method = tmp_path / "experiment" / "aenerf"
     shutil.copytree(run, method / "now")
     for above in (method, method.parent):
@@ -191,8 +199,11 @@ def test_a_run_goes_on_from_the_newest_whole_checkpoint(
     with pytest.raises(SystemExit, match=r"^Error: .*step-000000003.ckpt: .*--load-step 2\)$"):
         train_small_model(tmp_path, "refused", 2, load_checkpoint=folder / "step-000000003.ckpt")
     # A run that was told the step opens as every other.
-    told = train_small_model(tmp_path, "told", 2, load_dir=folder, load_step=2)
-    assert eval_setup(told.base_dir / "config.yml")[3] == 4
+    for option in ("load_dir", "load_checkpoint"):
+        told = train_small_model(tmp_path, f"told by {option}", 2, load_step=2, **{option: run})
+        assert eval_setup(told.base_dir / "config.yml")[3] == 4
+    with pytest.raises(SystemExit, match=r"^Error: ns-train: --load-step 2 names no run; give the run with --load-dir"):
+        train_small_model(tmp_path, "refused", 2, load_step=2)
 
 
 @contextmanager
