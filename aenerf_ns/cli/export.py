@@ -168,7 +168,8 @@ class ExportMesh(RunCommand):
             raise DataError(self.output, "not a mesh file", "choose another --output, ending with .ply, .glb or .obj")
         require_writable(self.output)
         require_range("resolution", self.resolution, 8, 2048)
-        require_range("num-views", self.num_views, 1, _MAX_VIEWS)
+        # A surface counts where two views see it.
+        require_range("num-views", self.num_views, 2, _MAX_VIEWS)
         _, run, _ = open_run(self.load_config, self.data, test_mode="inference")
         from aenerf_ns.export.mesh import extract_mesh
 

@@ -22,7 +22,7 @@ _MAX_BEYOND = 0.01
 _TRUNCATION = 4.0
 # Voxels along a side of a block, and blocks that memory is taken for at first: 0.4 GB.
 _BLOCK, _NUM_BLOCKS = 8, 40_000
-# Views that must have seen a surface.
+# More views than this must have seen a surface.
 _MIN_VIEWS = 1.0
 
 
@@ -34,7 +34,7 @@ def extract_mesh(run: TrainedRun, num_views: int, resolution: int) -> trimesh.Tr
 
     Args:
         run: in evaluation mode.
-        num_views: evenly spread over the time of the run.
+        num_views: evenly spread over the time of the run, two or more.
         resolution: voxels along the longest side of the box that is meshed: the dataset's scene box where it states
             one, else a box that holds nearly all that the views see.
 
@@ -42,10 +42,9 @@ def extract_mesh(run: TrainedRun, num_views: int, resolution: int) -> trimesh.Tr
         A mesh with vertex colors, in the recording's world and units.
 
     Raises:
-        DataError: the views see no surface.
+        DataError: the views see no surface, or no two of them the same one.
     """
     open3d = load_open3d()
-    no_surface = DataError(run.data, "the run renders no surface", "train it longer")
     given = run.recording.event_camera
     camera = CameraIntrinsics(given.width, given.height, given.fx, given.fy, given.cx, given.cy)
     poses = homogeneous(corrected_poses(run, spread_times(run.scene.window, num_views)))
@@ -62,7 +61,7 @@ def extract_mesh(run: TrainedRun, num_views: int, resolution: int) -> trimesh.Tr
         "nij,hwj->nhwi", poses[:, :3, :3], in_camera
     )
     if not (depths > 0).any():
-        raise no_surface
+        raise DataError(run.data, "the run renders no surface", "train it longer")
     low, high = _choose_box(run, points[depths > 0].numpy())
     depths[((points < torch.from_numpy(low)) | (points > torch.from_numpy(high))).any(-1)] = 0
     voxel = float((high - low).max()) / resolution
@@ -89,7 +88,8 @@ def extract_mesh(run: TrainedRun, num_views: int, resolution: int) -> trimesh.Tr
         grid.integrate(blocks, seen, shown, matrix, matrix, extrinsics, 1.0, farthest, _TRUNCATION)
     mesh = grid.extract_triangle_mesh(weight_threshold=_MIN_VIEWS)
     if len(mesh.triangle.indices) == 0:
-        raise no_surface
+        problem = f"no two of {num_views} views see the same surface in voxels of {voxel:.3g} units"
+        raise DataError(run.data, problem, "give a higher --num-views or --resolution, or train it longer")
     return trimesh.Trimesh(
         mesh.vertex.positions.numpy().astype(np.float64),
         mesh.triangle.indices.numpy().astype(np.int64),

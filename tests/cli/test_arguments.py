@@ -145,6 +145,7 @@ MISTAKES = [
     ("export-frames C --output O --rate 1 --times 1", 1, "--rate and --times are given"),
     ("export-mesh C --output O.stl", 1, "Error: O.stl: not a mesh file"),
     ("export-mesh C --output O.ply --num-views 1000000", 1, "Error: --num-views: 1000000 is out of range"),
+    ("export-mesh C --output O.ply --num-views 1", 1, "Error: --num-views: 1 is out of range; give a number from 2 to"),
     ("export-video C --output O.gif", 1, "Error: O.gif: only videos of the kind .mp4"),
     ("export-video C --output O.mp4 --frame-rate 0", 1, "Error: --frame-rate: 0.0 is out of range"),
 ]
