@@ -23,6 +23,7 @@ from nerfstudio.utils.decorators import check_main_thread
 
 from aenerf_ns.atomic_write import atomic_write
 from aenerf_ns.errors import DataError, errors_as_one_line
+from aenerf_ns.files.output_paths import require_writable
 from aenerf_ns.training import framework
 from aenerf_ns.training.checkpoints import checkpoint_to_load, step_of
 from aenerf_ns.training.datamanager import EventDataManager
@@ -139,6 +140,7 @@ class AENeRFTrainer(Trainer):
     def setup(self, test_mode: Literal["test", "val", "inference"] = "val") -> None:
         """Read the data, make the model, load a checkpoint to resume from, and save the configuration."""
         with errors_as_one_line(), _full_disk_as_one_line(self.base_dir), _missing_key_as_one_line(self.config.vis):
+            require_writable(self.base_dir / "config.yml", "--output-dir")
             # The viewer writes there before there is a configuration.
             self.base_dir.mkdir(parents=True, exist_ok=True)
             super().setup(test_mode)

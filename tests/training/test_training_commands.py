@@ -156,6 +156,14 @@ def test_a_dataset_that_cannot_be_used_ends_training_with_one_line(workspace: Pa
         train_here(deepcopy(aenerf_small.config), workspace / "nothing", workspace)
 
 
+def test_a_folder_that_cannot_be_written_ends_training_with_one_line(tmp_path: Path) -> None:
+    # In place of the folder of all runs.
+    (tmp_path / "outputs").touch()
+    # It is said before the data are read, which may take long.
+    with pytest.raises(SystemExit, match=r"^Error: \S+config.yml: it cannot be created \(Not a .*another --output-dir"):
+        train_here(deepcopy(aenerf_small.config), tmp_path / "nothing", tmp_path)
+
+
 def test_a_log_that_needs_a_key_ends_training_with_one_line(
     room: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
