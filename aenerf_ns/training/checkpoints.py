@@ -57,6 +57,18 @@ def checkpoint_to_load(path: Path, step: int | None = None) -> Path:
     raise DataError(folder, problem, remedy)
 
 
+def warn_of_later_checkpoints(folder: Path, start: int) -> None:
+    """Name on the console a checkpoint of another training, in the folder of one that begins at step ``start``.
+
+    Commands that open a run take its newest checkpoint.
+    """
+    newest = next(iter(_newest_first(folder)), None)
+    if newest is not None and step_of(newest) >= start:
+        problem = f"{newest.name} is of another training. While it is the newest, the run opens with it"
+        line = f"{folder}: {problem}: move it away, or give another --timestamp"
+        CONSOLE.print(line, style="yellow", markup=False, soft_wrap=True)
+
+
 def _require_whole(path: Path) -> None:
     """Raise a DataError that names the newest whole checkpoint beside a checkpoint, unless this one is whole."""
     fault = _fault(path)

@@ -25,7 +25,7 @@ from aenerf_ns.atomic_write import atomic_write
 from aenerf_ns.errors import DataError, errors_as_one_line
 from aenerf_ns.files.output_paths import require_writable
 from aenerf_ns.training import framework
-from aenerf_ns.training.checkpoints import checkpoint_to_load, step_of
+from aenerf_ns.training.checkpoints import checkpoint_to_load, step_of, warn_of_later_checkpoints
 from aenerf_ns.training.datamanager import EventDataManager
 from aenerf_ns.training.preflight import require_device
 from aenerf_ns.training.run_record import RunRecord, ScalarWriter
@@ -149,6 +149,7 @@ class AENeRFTrainer(Trainer):
                 raise DataError("ns-train", f"the checkpoint is of step {self._steps.start - 1}", "take more steps")
             if not comms.is_main_process():
                 return
+            warn_of_later_checkpoints(self.checkpoint_dir, self._steps.start)
             framework.set_end(self._steps.stop)
             framework.add_writer(ScalarWriter(self.base_dir, resumes=self._steps.start > 0))
             self._record = RunRecord(self.base_dir, self.config.machine.seed, self._steps)

@@ -206,6 +206,20 @@ def test_a_run_goes_on_from_the_newest_whole_checkpoint(
         train_small_model(tmp_path, "refused", 2, load_step=2)
 
 
+def test_a_training_beside_later_checkpoints_of_another_one_says_so(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    first = train_small_model(tmp_path, "run", 4, steps_per_save=2, save_only_latest_checkpoint=False)
+    assert "of another training" not in capsys.readouterr().out
+    # In the same folder.
+    resumed = {"load_dir": first.base_dir, "save_only_latest_checkpoint": False}
+    train_small_model(tmp_path, "run", 1, **resumed)
+    assert "of another training" not in capsys.readouterr().out
+    train_small_model(tmp_path, "run", 1, load_step=2, **resumed)
+    said = f"{first.checkpoint_dir}: step-000000004.ckpt is of another training. While it is the newest, the run opens"
+    assert said in capsys.readouterr().out
+
+
 @contextmanager
 def files_of_at_most(size: int) -> Iterator[None]:
     """Let no file grow beyond ``size`` bytes, as on a full disk."""
