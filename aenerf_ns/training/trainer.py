@@ -220,10 +220,15 @@ class AENeRFTrainer(Trainer):
             self.save_checkpoint(step)
             self._record.write("stopped", step + 1 - self._steps.start)
             self._record = None
-            left = framework.iterations_to_reach(self._steps.stop, step)
+            options = (
+                f"--load-dir {shlex.quote(str(self.base_dir))} --load-step {step} "
+                f"--max-num-iterations {framework.iterations_to_reach(self._steps.stop, step)}"
+            )
+            if not self.config.load_scheduler:
+                # The schedule that began with this piece goes on.
+                options += " --load-scheduler True"
             print(
-                f"Stopped after step {step}. Go on with the same command, and "
-                f"--load-dir {shlex.quote(str(self.base_dir))} --max-num-iterations {left} after the method's name, in "
+                f"Stopped after step {step}. Go on with the same command, and {options} after the method's name, in "
                 "place of these options where it has them",
                 flush=True,
             )

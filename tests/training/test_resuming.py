@@ -146,8 +146,25 @@ def test_a_training_that_is_asked_to_stop_leaves_a_checkpoint(
     assert read_scalars(file.parent)["Eval Loss"][0] == [5, 10][: asked_in // 5]
     said = capsys.readouterr().out
     assert f"Stopped after step {asked_in}. Go on with the same command" in said
-    assert f"--load-dir {file.parent} --max-num-iterations {left} after the method's name, in place" in said
+    options = f"--load-dir {file.parent} --load-step {asked_in} --max-num-iterations {left}"
+    assert f"{options} after the method's name, in place" in said
     assert_equal(checkpoint(uninterrupted), checkpoint(train(left, load_dir=file.parent)))
+
+
+def test_a_schedule_that_began_anew_goes_on(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """The options of the resumed command stay, but for those that the training names when it stops."""
+    first = train_small_model(tmp_path, "first", 4)
+    anew = {"load_dir": first.base_dir, "load_step": 3, "load_scheduler": False}
+    whole = train_small_model(tmp_path, "second", 9, **anew)
+    with pytest.raises(SystemExit):
+        train_small_model(
+            tmp_path, "asked", 9, prepare=lambda trainer: setattr(trainer, "_stopped_by", signal.SIGINT), **anew
+        )
+    said = re.search(r"and --load-dir (\S+) --load-step 4 --max-num-iterations 8 (.*) after", capsys.readouterr().out)
+    assert said is not None
+    assert said[2] == "--load-scheduler True"
+    named = {"load_dir": Path(said[1]), "load_step": 4, "load_scheduler": True}
+    assert_equal(checkpoint(whole), checkpoint(train_small_model(tmp_path, "third", 8, **named)))
 
 
 def test_a_training_that_is_asked_to_stop_before_its_first_step_takes_it(tmp_path: Path) -> None:
