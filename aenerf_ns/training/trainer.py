@@ -197,8 +197,8 @@ class AENeRFTrainer(Trainer):
 
         def stop(number: int, _: object) -> None:
             if self._record is None or self._stopped_by:
-                # Nothing is being trained, or the user does not want to wait.
-                raise KeyboardInterrupt
+                # The training is complete, and the user ends its viewer. Or the user does not want to wait.
+                raise SystemExit(128 + number if self._stopped_by else 0)
             self._stopped_by = number
             print("Stopping after this step. Once more stops at once, without a checkpoint.", flush=True)
             # A training that the viewer paused takes no further step by itself.

@@ -167,6 +167,27 @@ def test_a_schedule_that_began_anew_goes_on(tmp_path: Path, capsys: pytest.Captu
     assert_equal(checkpoint(whole), checkpoint(train_small_model(tmp_path, "third", 8, **named)))
 
 
+def test_a_training_that_is_asked_twice_stops_at_once(tmp_path: Path) -> None:
+    def ask_in_a_step(trainer: AENeRFTrainer) -> None:
+        step = trainer.train_iteration
+
+        def asked(index: int) -> object:
+            if index == 2:
+                os.kill(os.getpid(), signal.SIGINT)
+                os.kill(os.getpid(), signal.SIGTERM)
+            return step(index)
+
+        trainer.train_iteration = asked  # type: ignore[method-assign]
+
+    # Nerfstudio's launcher makes a traceback and success of a KeyboardInterrupt.
+    with pytest.raises(SystemExit) as stopped:
+        train_small_model(tmp_path, "asked", 12, prepare=ask_in_a_step)
+    assert stopped.value.code == 128 + signal.SIGTERM
+    assert not list(tmp_path.rglob("*.ckpt"))
+    (file,) = tmp_path.rglob("run.json")
+    assert json.loads(file.read_text())["state"] == "stopped"
+
+
 def test_a_training_that_is_asked_to_stop_before_its_first_step_takes_it(tmp_path: Path) -> None:
     with pytest.raises(SystemExit):
         train_small_model(tmp_path, "asked", 12, prepare=lambda trainer: setattr(trainer, "_stopped_by", signal.SIGINT))
