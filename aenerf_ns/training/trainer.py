@@ -139,7 +139,12 @@ class AENeRFTrainer(Trainer):
 
     def setup(self, test_mode: Literal["test", "val", "inference"] = "val") -> None:
         """Read the data, make the model, load a checkpoint to resume from, and save the configuration."""
-        with errors_as_one_line(), _full_disk_as_one_line(self.base_dir), _missing_key_as_one_line(self.config.vis):
+        with (
+            errors_as_one_line(),
+            _full_disk_as_one_line(self.base_dir),
+            _missing_key_as_one_line(self.config.vis),
+            _interrupt_as_exit_status(self.world_size),
+        ):
             require_writable(self.base_dir / "config.yml", "--output-dir")
             # The viewer writes there before there is a configuration.
             self.base_dir.mkdir(parents=True, exist_ok=True)
@@ -272,6 +277,19 @@ def _one_line_if_not_written(path: Path) -> Iterator[Path]:
         if "CUDA" in str(error):
             raise
         raise _not_written(path, error) from None
+
+
+@contextmanager
+def _interrupt_as_exit_status(world_size: int) -> Iterator[None]:
+    """Turn Ctrl-C into one line and its exit status. Nerfstudio's launcher makes a traceback and success of it."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        # Of several processes, the launcher terminates all at once.
+        if world_size > 1:
+            raise
+        print("Stopped.", flush=True)
+        raise SystemExit(128 + signal.SIGINT) from None
 
 
 @contextmanager

@@ -19,6 +19,7 @@ from nerfstudio.engine.trainer import Trainer
 from torch.utils._pytree import keystr, tree_flatten_with_path
 
 from aenerf_ns.report.run_files import read_scalars
+from aenerf_ns.training.datamanager import EventDataManager
 from aenerf_ns.training.trainer import AENeRFTrainer
 
 NUM_STEPS = 60
@@ -186,6 +187,17 @@ def test_a_training_that_is_asked_twice_stops_at_once(tmp_path: Path) -> None:
     assert not list(tmp_path.rglob("*.ckpt"))
     (file,) = tmp_path.rglob("run.json")
     assert json.loads(file.read_text())["state"] == "stopped"
+
+
+def test_a_training_that_is_asked_to_stop_while_it_is_set_up_stops_at_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    # While the events are read, which may take minutes.
+    monkeypatch.setattr(EventDataManager, "supervise", lambda *_: os.kill(os.getpid(), signal.SIGINT))
+    with pytest.raises(SystemExit) as stopped:
+        train_small_model(tmp_path, "asked", 12)
+    assert stopped.value.code == 128 + signal.SIGINT
+    assert capsys.readouterr().out.endswith("\nStopped.\n")
 
 
 def test_a_training_that_is_asked_to_stop_before_its_first_step_takes_it(tmp_path: Path) -> None:
