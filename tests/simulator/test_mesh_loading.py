@@ -85,6 +85,22 @@ def test_obj_with_concave_polygon(tmp_path: Path) -> None:
     np.testing.assert_allclose(mesh.color[mesh.faces[-1]], [[0.1, 0.6, 0.1]] * 3)
 
 
+def test_obj_counts_back_from_each_face(tmp_path: Path) -> None:
+    part = "v 0 0 {z}\nv 1 0 {z}\nv 0 1 {z}\nvt 0 0\nvt {z} 0\nvt 0 1\nf {face}\n"
+    for corners in ("-3 -2 -1", "-3/-3 -2/-2 -1/-1", "-3/-3/ -2/-2/ -1/-1/"):
+        (tmp_path / "a.obj").write_text(part.format(z=1, face=corners) + part.format(z=2, face=corners))
+        mesh = load_mesh(tmp_path / "a.obj", False)
+        assert mesh.vertices[mesh.faces].tolist() == [[[0, 0, z], [1, 0, z], [0, 1, z]] for z in (1, 2)]
+        if "/" in corners:
+            assert mesh.uv[mesh.faces].tolist() == [[[0, 0], [z, 0], [0, 1]] for z in (1, 2)]
+
+
+def test_obj_with_tabs_and_a_byte_order_mark(tmp_path: Path) -> None:
+    (tmp_path / "a.obj").write_text("\ufeffv\t0 0 0\n\tv 2\t0 0\nv\t0 2 0\nf\t1\t2 3\n", encoding="utf-8")
+    mesh = load_mesh(tmp_path / "a.obj", False)
+    assert mesh.vertices[mesh.faces].tolist() == [[[0, 0, 0], [2, 0, 0], [0, 2, 0]]]
+
+
 TRIANGLE = "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n"
 
 
@@ -102,6 +118,9 @@ TRIANGLE = "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n"
         ("a.ply", "ply\n", "a.ply: "),
         ("a.ply", "ply\nformat ascii 1.0\nelement vertex 3\n", "a.ply: "),
         ("a.obj", TRIANGLE.replace("3\n", "99\n"), "a.obj: "),
+        ("a.obj", TRIANGLE.replace("1 2 3", "0 1 2"), "the vertex 0, but the first one is 1"),
+        ("a.obj", TRIANGLE.replace("1 2 3", "1/1 2/1 -4/1"), "the vertex 0, but the first one is 1"),
+        ("a.obj", TRIANGLE.replace("1 2 3", "-9 2 3"), "the vertex -5, but the first one is 1"),
         ("a.obj", TRIANGLE[:-8], "there is no surface in it"),
         ("a.obj", TRIANGLE.replace("0 1 0", "2 0 0"), "no face has an area"),
         ("a.obj", TRIANGLE.replace("0 1 0", "0 nan 0"), "not finite"),

@@ -108,13 +108,19 @@ def _build_mesh(path: Path, content: bytes, y_up: bool, gloss: Mapping[str, Glos
     if suffix == ".glb":
         _require_plain_glb(path, content)
     elif suffix == ".obj":
-        text = content.decode("utf-8", errors="replace").replace("\r\n", "\n").replace("\\\n", " ")
-        libraries = [name.strip() for name in re.findall(r"^[ \t]*mtllib(.*)", text, re.MULTILINE)]
-        used = {name.strip() for name in re.findall(r"^[ \t]*usemtl(.*)", text, re.MULTILINE)}
+        text = content.decode("utf-8-sig", errors="replace").replace("\r\n", "\n").replace("\\\n", " ")
+        # trimesh passes over lines that begin with a blank, or have tabs.
+        text = re.sub(r"^ +", "", text.replace("\t", " "), flags=re.MULTILINE)
+        libraries = [name.strip() for name in re.findall(r"^mtllib(.*)", text, re.MULTILINE)]
+        used = {name.strip() for name in re.findall(r"^usemtl(.*)", text, re.MULTILINE)}
         if len(libraries) > 1:
             raise DataError(path, f"{len(libraries)} material files", "join them into one")
         # trimesh takes a comment behind a face for a corner.
-        content = _triangulate_obj(re.sub(r"^(f[ \t][^#\n]*)#.*", r"\1", text, flags=re.MULTILINE)).encode()
+        text = re.sub(r"^(f [^#\n]*)#.*", r"\1", text, flags=re.MULTILINE)
+        text = _count_from_beginning(text)
+        if wrong := re.search(r"^f (?:.* )?([-0]\d*)", text, re.MULTILINE):
+            raise DataError(path, f"a face has the vertex {wrong[1]}, but the first one is 1", _REMEDY)
+        content = _triangulate_obj(text).encode()
     files = _FilesBeside(path, libraries[0] if libraries else None)
     scene = trimesh.load_scene(BytesIO(content), file_type=suffix[1:], resolver=files, process=False)
     if files.errors:
@@ -241,19 +247,40 @@ def triangulate(corners: Array) -> NDArray[np.int64]:
     return triangles.reshape(-1, 3).astype(np.int64)
 
 
+def _count_from_beginning(text: str) -> str:
+    """Return the text of an .obj file whose faces count back from their own line with positive numbers instead.
+
+    trimesh counts them back from the end of the file.
+    """
+    if not re.search(r"^f .*-", text, re.MULTILINE):
+        return text
+    lines = text.split("\n")
+    counts = {"v": 0, "vt": 0, "vn": 0}
+    for number, line in enumerate(lines):
+        key, *names = line.split() or [""]
+        if key in counts:
+            counts[key] += 1
+        elif key == "f":
+            corners = (zip(name.split("/"), counts.values(), strict=False) for name in names)
+            lines[number] = "f " + " ".join(
+                "/".join(str(count + 1 + int(index)) if index.startswith("-") else index for index, count in corner)
+                for corner in corners
+            )
+    return "\n".join(lines)
+
+
 def _triangulate_obj(text: str) -> str:
     """Return the text of an .obj file with its concave polygons cut into triangles. trimesh fills all by a fan."""
-    if not re.search(r"^f(?:[ \t]+\S+){4}", text, re.MULTILINE):
+    if not re.search(r"^f(?: +\S+){4}", text, re.MULTILINE):
         return text
     lines = text.split("\n")
     vertices: list[str] = []
     polygons: dict[int, list[tuple[int, list[int]]]] = {}
     for number, line in enumerate(lines):
-        if line.startswith(("v ", "v\t")):
+        if line.startswith("v "):
             vertices.append(line)
-        elif line.startswith(("f ", "f\t")) and len(names := line.split()[1:]) > 3:
-            index = [int(name.partition("/")[0]) for name in names]
-            corners = [i - 1 if i > 0 else len(vertices) + i for i in index]
+        elif line.startswith("f ") and len(names := line.split()[1:]) > 3:
+            corners = [int(name.partition("/")[0]) - 1 for name in names]
             polygons.setdefault(len(corners), []).append((number, corners))
     positions = np.array([line.split()[1:4] for line in vertices], np.float64)
     for rows in polygons.values():
