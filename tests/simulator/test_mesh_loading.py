@@ -85,6 +85,14 @@ def test_obj_with_concave_polygon(tmp_path: Path) -> None:
     np.testing.assert_allclose(mesh.color[mesh.faces[-1]], [[0.1, 0.6, 0.1]] * 3)
 
 
+def test_obj_vertex_colors_beside_a_material(tmp_path: Path) -> None:
+    (tmp_path / "a.mtl").write_text("newmtl a\nKd 0.5 1 1\n")
+    colored = "mtllib a.mtl\nv 0 0 0 1 0.5 0\nv 1 0 0 1 0.5 0\nv 0 1 0 1 0.5 0\nusemtl a\nf 1 2 3\n"
+    (tmp_path / "a.obj").write_text(colored)
+    mesh = load_mesh(tmp_path / "a.obj", False)
+    np.testing.assert_allclose(mesh.color[mesh.faces], [[[0.5, float(decode(np.array(0.5), "srgb")), 0]] * 3])
+
+
 def test_obj_counts_back_from_each_face(tmp_path: Path) -> None:
     part = "v 0 0 {z}\nv 1 0 {z}\nv 0 1 {z}\nvt 0 0\nvt {z} 0\nvt 0 1\nf {face}\n"
     for corners in ("-3 -2 -1", "-3/-3 -2/-2 -1/-1", "-3/-3/ -2/-2/ -1/-1/"):

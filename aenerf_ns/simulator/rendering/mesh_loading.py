@@ -177,7 +177,8 @@ def _build_part(
     elif visual.kind == "texture":
         factor, image = _base_color(visual.material)
         color = np.tile(factor, (len(vertices), 1))
-        painted = visual.vertex_attributes.get("color")
+        # trimesh keeps the colors of a .glb with its materials, and those of an .obj with its vertices.
+        painted = visual.vertex_attributes.get("color", mesh.vertex_attributes.get("color"))
         if painted is not None and len(painted) == len(vertices):
             color = color * _linear_colors(painted, is_gltf)
         if image is not None and visual.uv is not None and len(visual.uv) == len(vertices):
