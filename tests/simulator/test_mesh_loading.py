@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import trimesh
 from helpers.small_meshes import BLACK, OVERHEAD, baked_mesh, painted_box
+from PIL import Image
 
 from aenerf_ns.camera.image_encoding import decode
 from aenerf_ns.errors import DataError
@@ -110,6 +111,7 @@ def test_obj_with_tabs_and_a_byte_order_mark(tmp_path: Path) -> None:
 
 
 TRIANGLE = "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n"
+TEXTURED = "v 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nf 1/1 2/1 3/1\n"
 
 
 # A warning of a library would print a second line.
@@ -143,6 +145,7 @@ TRIANGLE = "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n"
         ("a.obj", f"mtllib d.mtl\nusemtl \n{TRIANGLE}", "no material ''"),
         ("a.obj", f"mtllib e.mtl\nusemtl e\n{TRIANGLE}", "e.png: not a picture"),
         ("a.obj", f"mtllib f.mtl\nusemtl f\n{TRIANGLE}", "options of a texture"),
+        ("a.obj", f"mtllib h.mtl\nusemtl h\n{TEXTURED}", "a texture of more than 8 bits (PIL's mode I;16)"),
         ("a.obj", f"mtllib g.mtl\nusemtl g\n{TRIANGLE}", "outside the folder"),
     ],
 )  # fmt: skip
@@ -153,6 +156,8 @@ def test_refuse_mesh(tmp_path: Path, name: str, content: str, problem: str) -> N
     (tmp_path / "e.png").write_text("no")
     (tmp_path / "f.mtl").write_text("newmtl f\nmap_Kd -s 2 2 2 e.png\n")
     (tmp_path / "g.mtl").write_text("newmtl g\nmap_Kd ../e.png\n")
+    (tmp_path / "h.mtl").write_text("newmtl h\nmap_Kd h.png\n")
+    Image.fromarray(np.full((4, 4), 1000, np.uint16)).save(tmp_path / "h.png")
     (tmp_path / name).write_text(content)
     with pytest.raises(DataError) as raised:
         open_scene(str(tmp_path / name))

@@ -186,6 +186,10 @@ def _build_part(
             if not np.isfinite(uv).all():
                 raise DataError(path, "texture coordinates that are not finite", _REMEDY)
             if id(image) not in textures:
+                # PIL clips the values of deeper pictures to 8 bits.
+                if image.mode.startswith(("I", "F")):
+                    remedy = "store the textures with 8 bits"
+                    raise DataError(path, f"a texture of more than 8 bits (PIL's mode {image.mode})", remedy)
                 linear = decode(np.arange(256) / 255, "srgb").astype(np.float32)
                 textures[id(image)] = linear[np.asarray(image.convert("RGB"))[::-1]]
             index = list(textures).index(id(image))
