@@ -94,10 +94,25 @@ def test_obj_vertex_colors_beside_a_material(tmp_path: Path) -> None:
     np.testing.assert_allclose(mesh.color[mesh.faces], [[[0.5, float(decode(np.array(0.5), "srgb")), 0]] * 3])
 
 
+def test_colors_of_unusual_material_files(tmp_path: Path) -> None:
+    materials = "\ufeffnewmtl a\nKd 0.2 0.3 0.4 # blue\nKs 0.5\nnewmtl b\nKd 0.6\n"
+    (tmp_path / "a.mtl").write_text(materials, encoding="utf-8")
+    corners = "v 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\n"
+    faces = "f 1/1 2/1 3/1\nusemtl a\nf 1/1 2/1 3/1\nusemtl b\nf 1/1 2/1 3/1\n"
+    (tmp_path / "a.obj").write_text(f"mtllib a.mtl\n{corners}{faces}")
+    mesh = load_mesh(tmp_path / "a.obj", False)
+    # A face without a material is as gray as in a file without materials.
+    np.testing.assert_allclose(mesh.color[mesh.faces][:, 0], [[0.5] * 3, [0.2, 0.3, 0.4], [0.6] * 3])
+    assert mesh.textures == ()
+
+
 def test_obj_counts_back_from_each_face(tmp_path: Path) -> None:
     part = "v 0 0 {z}\nv 1 0 {z}\nv 0 1 {z}\nvt 0 0\nvt {z} 0\nvt 0 1\nf {face}\n"
+    (tmp_path / "a.mtl").write_text("newmtl a\nmap_Kd a.png\n")
+    Image.new("RGB", (2, 2)).save(tmp_path / "a.png")
     for corners in ("-3 -2 -1", "-3/-3 -2/-2 -1/-1", "-3/-3/ -2/-2/ -1/-1/"):
-        (tmp_path / "a.obj").write_text(part.format(z=1, face=corners) + part.format(z=2, face=corners))
+        parts = part.format(z=1, face=corners) + part.format(z=2, face=corners)
+        (tmp_path / "a.obj").write_text(f"mtllib a.mtl\nusemtl a\n{parts}")
         mesh = load_mesh(tmp_path / "a.obj", False)
         assert mesh.vertices[mesh.faces].tolist() == [[[0, 0, z], [1, 0, z], [0, 1, z]] for z in (1, 2)]
         if "/" in corners:
@@ -145,6 +160,7 @@ TEXTURED = "v 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nf 1/1 2/1 3/1\n"
         ("a.obj", f"mtllib d.mtl\nusemtl \n{TRIANGLE}", "no material ''"),
         ("a.obj", f"mtllib e.mtl\nusemtl e\n{TRIANGLE}", "e.png: not a picture"),
         ("a.obj", f"mtllib f.mtl\nusemtl f\n{TRIANGLE}", "options of a texture"),
+        ("a.obj", f"mtllib i.mtl\nusemtl i\n{TRIANGLE}", "the color 'xyz 1 1 1'"),
         ("a.obj", f"mtllib h.mtl\nusemtl h\n{TEXTURED}", "a texture of more than 8 bits (PIL's mode I;16)"),
         ("a.obj", f"mtllib g.mtl\nusemtl g\n{TRIANGLE}", "outside the folder"),
     ],
@@ -157,6 +173,7 @@ def test_refuse_mesh(tmp_path: Path, name: str, content: str, problem: str) -> N
     (tmp_path / "f.mtl").write_text("newmtl f\nmap_Kd -s 2 2 2 e.png\n")
     (tmp_path / "g.mtl").write_text("newmtl g\nmap_Kd ../e.png\n")
     (tmp_path / "h.mtl").write_text("newmtl h\nmap_Kd h.png\n")
+    (tmp_path / "i.mtl").write_text("newmtl i\nKd xyz 1 1 1\n")
     Image.fromarray(np.full((4, 4), 1000, np.uint16)).save(tmp_path / "h.png")
     (tmp_path / name).write_text(content)
     with pytest.raises(DataError) as raised:

@@ -90,14 +90,35 @@ class _FilesBeside(trimesh.resolvers.FilePathResolver):
         file = file_inside(self._path.parent, name, self._path)
         content = _read(file)
         if name == self._library:
-            names = re.findall(rb"^[ \t]*newmtl[ \t]+(.*)", content, re.MULTILINE)
-            self.materials |= {name.decode(errors="replace").strip() for name in names}
+            content = self._read_materials(file, content.decode("utf-8-sig", errors="replace")).encode()
         elif self._library is not None:
             try:
                 Image.open(BytesIO(content)).close()
             except OSError as error:
                 raise DataError(file, f"not a picture ({error})", "give a PNG or JPEG file") from error
         return content
+
+    def _read_materials(self, path: Path, text: str) -> str:
+        """Return the lines of a material file that are used. trimesh drops a color with a comment, and all materials
+        because of another line that it does not expect."""
+        lines = []
+        for line in text.splitlines():
+            key, _, value = line.strip().replace("\t", " ").partition(" ")
+            key, value = key.lower(), value.strip()
+            if key == "newmtl":
+                self.materials.add(value)
+            elif key == "kd":
+                try:
+                    numbers = [float(number) for number in value.partition("#")[0].split()]
+                except ValueError:
+                    numbers = []
+                if len(numbers) not in (1, 3):
+                    raise DataError(path, f"the color {value!r}", "write three numbers, as in Kd 0.5 0.5 0.5")
+                red, green, blue = numbers * (3 // len(numbers))
+                value = f"{red!r} {green!r} {blue!r}"
+            if key in ("newmtl", "kd", "map_kd"):
+                lines.append(f"{key} {value}")
+        return "\n".join(lines)
 
 
 def _build_mesh(path: Path, content: bytes, y_up: bool, gloss: Mapping[str, Gloss]) -> Mesh:
@@ -208,6 +229,9 @@ def _base_color(material: Any) -> tuple[Array, Any]:
         return (np.ones(3) if factor is None else np.asarray(factor)[:3] / 255.0), material.baseColorTexture
     # trimesh rounds `diffuse` to 8 bits, but keeps the file's own value in `kwargs`.
     image, factor = material.image, (material.kwargs or {}).get("kd")
+    if image is not None and image.format is None:
+        # It comes from no file: trimesh paints surfaces without a material in a gray of its own.
+        image = None
     if factor is not None and np.size(factor) == 3:
         return np.asarray(factor, np.float64), image
     return np.full(3, _UNCOLORED if image is None else 1.0), image
