@@ -141,7 +141,7 @@ def _build_mesh(path: Path, content: bytes, y_up: bool, gloss: Mapping[str, Glos
         text = _count_from_beginning(text)
         if wrong := re.search(r"^f (?:.* )?([-0]\d*)", text, re.MULTILINE):
             raise DataError(path, f"a face has the vertex {wrong[1]}, but the first one is 1", _REMEDY)
-        content = _triangulate_obj(text).encode()
+        content = _triangulate_obj(_with_texture_coordinates(text)).encode()
     files = _FilesBeside(path, libraries[0] if libraries else None)
     scene = trimesh.load_scene(BytesIO(content), file_type=suffix[1:], resolver=files, process=False)
     if files.errors:
@@ -296,6 +296,19 @@ def _count_from_beginning(text: str) -> str:
                 for corner in corners
             )
     return "\n".join(lines)
+
+
+def _with_texture_coordinates(text: str) -> str:
+    """Return the text of an .obj file where faces without texture coordinates have (0, 0) if others have some.
+
+    trimesh drops the texture of a material if one of its faces has no coordinates.
+    """
+    bare = re.compile(r"^f \d+(?: |//).*", re.MULTILINE)
+    if not bare.search(text) or not re.search(r"^f \d+/\d", text, re.MULTILINE):
+        return text
+    last = len(re.findall(r"^vt ", text, re.MULTILINE)) + 1
+    text = bare.sub(lambda line: re.sub(r" (\d+)\S*", rf" \1/{last}", line[0]), text)
+    return f"{text}\nvt 0 0\n"
 
 
 def _triangulate_obj(text: str) -> str:
