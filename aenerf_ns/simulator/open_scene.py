@@ -31,6 +31,8 @@ from aenerf_ns.simulator.scene import SimulationScene
 _RADIUS = 4.0
 _RADII = 3.6
 """Default distance of the camera from an object: in meters, and in half diagonals of the object's bounds."""
+_MAX_RADII_AWAY = 100
+"""Half diagonals from the origin within which float32, in which rays are traced, tells the surfaces of a mesh apart."""
 _MAX_RADIANCE = 0.9
 """Radiance that the brightest surface in probes of the path is scaled to, with room for brighter ones between them."""
 
@@ -152,8 +154,12 @@ def _load_scene(path: Path, seed: int) -> SimulationScene:
     background = None if values.background == "environment" else np.array(values.background or (0.5, 0.5, 0.5))
 
     mesh, scale = load_mesh(file, up == "y", coats), values.scale
+    corners = mesh.vertices[mesh.faces].reshape(-1, 3)
+    half_diagonal = 0.5 * float(np.linalg.norm(np.ptp(corners, axis=0)))
+    if np.abs(corners).max() > _MAX_RADII_AWAY * half_diagonal > 0:
+        problem = f"it lies around {corners.mean(axis=0).round(1)}, too far from the origin for its size"
+        raise DataError(file, f"{problem} of {2 * half_diagonal:.3g}", "move it to the origin")
     if is_bare:
-        half_diagonal = 0.5 * float(np.linalg.norm(np.ptp(mesh.vertices[mesh.faces].reshape(-1, 3), axis=0)))
         scale = _RADIUS / (_RADII * half_diagonal) if half_diagonal > 0 else 1.0
     with value_errors_as_data_error(file, "give a mesh of triangles"):
         mesh, num_coincident = repair(scaled(mesh, scale))

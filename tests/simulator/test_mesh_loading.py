@@ -162,6 +162,7 @@ TEXTURED = "v 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nf 1/1 2/1 3/1\n"
         ("a.obj", TRIANGLE.replace("0 1 0", "2 0 0"), "no face has an area"),
         ("a.obj", TRIANGLE.replace("0 1 0", "0 nan 0"), "not finite"),
         ("a.obj", TRIANGLE.replace("v 1", "v inf"), "not finite"),
+        ("a.obj", TRIANGLE.replace("v ", "v 40000"), "too far from the origin for its size of 1.41; move it"),
         ("a.obj", f"mtllib \n{TRIANGLE}", "a.obj: "),
         ("a.obj", f"mtllib .\n{TRIANGLE}", "a.obj: "),
         ("a.obj", f"mtllib {'m' * 5000}\n{TRIANGLE}", "cannot be read"),
