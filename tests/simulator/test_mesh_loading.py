@@ -138,6 +138,11 @@ def test_obj_with_tabs_and_a_byte_order_mark(tmp_path: Path) -> None:
 
 
 TRIANGLE = "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n"
+PAINTED = (
+    "ply\nformat ascii 1.0\n{}\nelement vertex 3\nproperty float x\nproperty float y\nproperty float z\n"
+    "property float s\nproperty float t\nelement face 1\nproperty list uchar int vertex_indices\nend_header\n"
+    "0 0 0 0 0\n1 0 0 1 0\n0 1 0 0 1\n3 0 1 2\n"
+)
 TEXTURED = "v 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nf 1/1 2/1 3/1\n"
 
 
@@ -154,6 +159,9 @@ TEXTURED = "v 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nf 1/1 2/1 3/1\n"
         ("a.glb", "glTF", "not a binary glTF file"),
         ("a.ply", "ply\n", "a.ply: "),
         ("a.ply", "ply\nformat ascii 1.0\nelement vertex 3\n", "a.ply: "),
+        ("a.ply", PAINTED.format("comment TextureFile gone.png"), "gone.png: there is no such file"),
+        ("a.ply", PAINTED.format("comment TextureFile e.png"), "e.png: not a picture"),
+        ("a.ply", PAINTED.format("comment TextureFile h.png\ncomment TextureFile e.png"), "2 textures; join them"),
         ("a.obj", TRIANGLE.replace("3\n", "99\n"), "a.obj: "),
         ("a.obj", TRIANGLE.replace("1 2 3", "0 1 2"), "the vertex 0, but the first one is 1"),
         ("a.obj", TRIANGLE.replace("1 2 3", "1/1 2/1 -4/1"), "the vertex 0, but the first one is 1"),
@@ -178,7 +186,7 @@ TEXTURED = "v 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nf 1/1 2/1 3/1\n"
         ("a.obj", f"mtllib g.mtl\nusemtl g\n{TRIANGLE}", "outside the folder"),
     ],
 )  # fmt: skip
-def test_refuse_mesh(tmp_path: Path, name: str, content: str, problem: str) -> None:
+def test_refuse_mesh(tmp_path: Path, name: str, content: str, problem: str, caplog: pytest.LogCaptureFixture) -> None:
     (tmp_path / "c.mtl").write_text("newmtl c\nmap_Kd c.png\n")
     (tmp_path / "d.mtl").write_text("newmtl d\nKd 1 1 1\n")
     (tmp_path / "e.mtl").write_text("newmtl e\nmap_Kd e.png\n")
@@ -192,3 +200,4 @@ def test_refuse_mesh(tmp_path: Path, name: str, content: str, problem: str) -> N
     with pytest.raises(DataError) as raised:
         open_scene(str(tmp_path / name))
     assert problem in str(raised.value)
+    assert not caplog.records

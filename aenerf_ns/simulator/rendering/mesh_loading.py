@@ -68,7 +68,7 @@ class _FilesBeside(trimesh.resolvers.FilePathResolver):
 
     Args:
         path: the mesh.
-        library: name of the material file of an .obj, or None. All other files of an .obj are textures.
+        library: name of the material file of an .obj, or None. All other files of an .obj or .ply are textures.
     """
 
     def __init__(self, path: Path, library: str | None) -> None:
@@ -91,7 +91,7 @@ class _FilesBeside(trimesh.resolvers.FilePathResolver):
         content = _read(file)
         if name == self._library:
             content = self._read_materials(file, content.decode("utf-8-sig", errors="replace")).encode()
-        elif self._library is not None:
+        elif self._path.suffix.lower() != ".glb":
             try:
                 Image.open(BytesIO(content)).close()
             except OSError as error:
@@ -143,6 +143,14 @@ def _build_mesh(path: Path, content: bytes, y_up: bool, gloss: Mapping[str, Glos
             raise DataError(path, f"a face has the vertex {wrong[1]}, but the first one is 1", _REMEDY)
         content = _triangulate_obj(_with_texture_coordinates(text)).encode()
     files = _FilesBeside(path, libraries[0] if libraries else None)
+    if suffix == ".ply":
+        header = content.partition(b"end_header")[0].decode("utf-8", errors="replace")
+        pictures = re.findall(r"^comment +TextureFile +(.*)", header, re.MULTILINE | re.IGNORECASE)
+        if len(pictures) > 1:
+            raise DataError(path, f"{len(pictures)} textures", "join them into one, or export the mesh as .glb")
+        # trimesh would print where a picture that is missing is asked for.
+        for picture in pictures:
+            files.get(picture)
     scene = trimesh.load_scene(BytesIO(content), file_type=suffix[1:], resolver=files, process=False)
     if files.errors:
         raise files.errors[0]
