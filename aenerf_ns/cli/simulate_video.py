@@ -209,6 +209,8 @@ class SimulateVideo(SimulationCommand):
         missing = ""
         if camera is None:
             stated = f'"bandwidth_hz": {writer.sensor.bandwidth:.4g}, thresholds and refractory period of this command'
+            if writer.sensor.bayer_pattern:
+                stated = f'"bayer_pattern": "{writer.sensor.bayer_pattern}", {stated}'
             missing = f'calibration.json (with "image_encoding": "srgb", {stated}) and '
         return (
             f"{self.output}: {writer.events.num_events:,} events of {len(video.times)} frames, {len(kept)} images, "

@@ -173,8 +173,14 @@ def test_video_without_poses_becomes_a_recording(frames: Path, camchain: Path, t
     printed = simulate(tmp_path / "no_lens", video=frames, validation_views=0, test_views=0, train_images=4)
     assert "4 images, no poses" in printed
     assert "add calibration.json (with " in printed
+    assert "bayer_pattern" not in printed
     written = ["events.h5", "images", "images.txt", "thresholds_ground_truth.npz"]
     assert sorted(path.name for path in (tmp_path / "no_lens").iterdir()) == written
+
+
+def test_the_filters_of_a_color_sensor_belong_into_its_calibration(frames: Path, tmp_path: Path) -> None:
+    printed = simulate(tmp_path / "color", video=frames, bayer_pattern="GRBG")
+    assert '"bayer_pattern": "GRBG", ' in printed
 
 
 def test_frame_of_another_size_leaves_nothing(frames: Path, tmp_path: Path) -> None:
