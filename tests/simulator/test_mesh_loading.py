@@ -138,6 +138,29 @@ def test_obj_with_tabs_and_a_byte_order_mark(tmp_path: Path) -> None:
 
 
 TRIANGLE = "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n"
+
+
+def ply(*faces: str, vertex: str = "", face: str = "") -> str:
+    """Write five corners of a concave polygon, and faces, as a .ply. Of other properties all values are 0."""
+
+    def properties(stated: str) -> list[str]:
+        kind, *names = stated.split() or [""]
+        return [f"property {kind} {name}" for name in names]
+
+    zeros = {key: " 0" * len(properties(key)) for key in (vertex, face)}
+    header = ["ply", "format ascii 1.0", "element vertex 5", *(f"property float {axis}" for axis in "xyz")]
+    header += [*properties(vertex), f"element face {len(faces)}", "property list uchar int vertex_indices"]
+    header += [*properties(face), "end_header"]
+    corners = [f"{corner} 0{zeros[vertex]}" for corner in ("0 0", "2 0", "2 2", "1 0.5", "0 2")]
+    return "\n".join([*header, *corners, *(f"{len(row.split())} {row}{zeros[face]}" for row in faces), ""])
+
+
+def test_convex_polygons_of_a_ply(tmp_path: Path) -> None:
+    (tmp_path / "a.ply").write_text(ply("0 1 2 4", "0 1 3"))
+    mesh = load_mesh(tmp_path / "a.ply", False)
+    np.testing.assert_allclose(normals_and_areas(mesh)[1].sum(), 4 + 0.5)
+
+
 PAINTED = (
     "ply\nformat ascii 1.0\n{}\nelement vertex 3\nproperty float x\nproperty float y\nproperty float z\n"
     "property float s\nproperty float t\nelement face 1\nproperty list uchar int vertex_indices\nend_header\n"
@@ -157,8 +180,12 @@ TEXTURED = "v 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nf 1/1 2/1 3/1\n"
         ("a.stl", "", "an unknown scene"),
         ("a.glb", "", "not a binary glTF file"),
         ("a.glb", "glTF", "not a binary glTF file"),
-        ("a.ply", "ply\n", "a.ply: "),
+        ("a.ply", "ply\n", "export the mesh again, as triangles"),
         ("a.ply", "ply\nformat ascii 1.0\nelement vertex 3\n", "a.ply: "),
+        ("a.ply", ply("0 1 2 3 4"), "concave polygons; export it as triangles"),
+        ("a.ply", ply("0 1 2", "0 1 2 3 4"), "concave polygons; export it as triangles"),
+        ("a.ply", ply("0 1 2 4", face="uchar red green blue"), "polygons with a color each; export it as triangles"),
+        ("a.ply", ply("0 1 2", vertex="ushort red green blue"), "colors of 16 bits; export them with 8"),
         ("a.ply", PAINTED.format("comment TextureFile gone.png"), "gone.png: there is no such file"),
         ("a.ply", PAINTED.format("comment TextureFile e.png"), "e.png: not a picture"),
         ("a.ply", PAINTED.format("comment TextureFile h.png\ncomment TextureFile e.png"), "2 textures; join them"),

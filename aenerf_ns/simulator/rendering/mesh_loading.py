@@ -53,7 +53,8 @@ def load_mesh(path: Path, y_up: bool, gloss: Mapping[str, Gloss] | None = None) 
     except DataError:
         raise
     except Exception as error:  # a malformed file raises exceptions of any kind in trimesh
-        raise DataError(path, f"cannot be read ({error})", _REMEDY) from error
+        remedy = f"{_REMEDY}, as triangles" if path.suffix.lower() == ".ply" else _REMEDY
+        raise DataError(path, f"cannot be read ({error})", remedy) from error
 
 
 def _read(path: Path) -> bytes:
@@ -148,6 +149,8 @@ def _build_mesh(path: Path, content: bytes, y_up: bool, gloss: Mapping[str, Glos
         pictures = re.findall(r"^comment +TextureFile +(.*)", header, re.MULTILINE | re.IGNORECASE)
         if len(pictures) > 1:
             raise DataError(path, f"{len(pictures)} textures", "join them into one, or export the mesh as .glb")
+        if re.search(r"^property +u?(?:short|int16) +red\b", header, re.MULTILINE):
+            raise DataError(path, "colors of 16 bits", "export them with 8 bits")
         # trimesh would print where a picture that is missing is asked for.
         for picture in pictures:
             files.get(picture)
@@ -162,6 +165,9 @@ def _build_mesh(path: Path, content: bytes, y_up: bool, gloss: Mapping[str, Glos
     placed = [(mesh, transform) for mesh, transform in placed if len(getattr(mesh, "faces", ()))]
     if not placed:
         raise DataError(path, "there is no surface in it", "give a mesh of triangles, not points or lines")
+    if suffix == ".ply":
+        for mesh, _ in placed:
+            _require_convex(path, mesh)
     names = [getattr(getattr(mesh.visual, "material", None), "name", None) or "" for mesh, _ in placed]
     for name in gloss:
         if name not in names:
@@ -196,6 +202,8 @@ def _build_part(
         raise DataError(path, "a face has a vertex that does not exist", _REMEDY)
     visual = mesh.visual
     if visual.kind == "face":
+        if len(visual.face_colors) != len(faces):
+            raise DataError(path, "polygons with a color each", "export it as triangles")
         # Face colors need separate vertices for each face.
         vertices, faces = vertices[faces].reshape(-1, 3), np.arange(3 * len(faces)).reshape(-1, 3)
     uv, index, color = np.zeros((len(vertices), 2)), -1, np.full((len(vertices), 3), _UNCOLORED)
@@ -284,6 +292,35 @@ def triangulate(corners: Array) -> NDArray[np.int64]:
     return triangles.reshape(-1, 3).astype(np.int64)
 
 
+def _least_turns(corners: Array) -> Array:
+    """Return the least turn (P,) at a corner of each of P polygons (P, N, 3), negative where they are concave.
+
+    A turn is the sine of its angle, times the adjacent sides, times twice the polygon's area.
+    """
+    edges = np.roll(corners, -1, axis=1) - corners
+    turns = np.cross(edges, np.roll(edges, -1, axis=1))
+    normals = np.cross(corners, np.roll(corners, -1, axis=1)).sum(axis=1, keepdims=True)
+    return (turns * normals).sum(axis=-1).min(axis=1)
+
+
+def _require_convex(path: Path, mesh: Any) -> None:
+    """Raise a DataError if a .ply has a polygon that a fan of triangles, as trimesh makes it, does not fill."""
+    elements = mesh.metadata["_ply_raw"]
+    points = np.column_stack([elements["vertex"]["data"][axis] for axis in "xyz"]).astype(np.float64)
+    columns = elements["face"]["data"]
+    names = [*(columns.dtype.names if isinstance(columns, np.ndarray) else columns)]
+    polygons = columns[next((name for name in names if name in ("vertex_index", "vertex_indices")), names[0])]
+    # Of a binary file, the corners follow their number. Of a text file, polygons of several lengths are objects.
+    rows = polygons["f1"] if polygons.dtype.names else polygons
+    lengths = np.array([len(row) for row in rows]) if rows.ndim == 1 else np.full(len(rows), rows.shape[1])
+    for length in np.unique(lengths[lengths > 3]):
+        corners = points[np.stack(rows[lengths == length]).astype(np.int64)]
+        size = np.ptp(corners, axis=1).max(axis=1)
+        # Fans fill what rounding makes concave all but exactly.
+        if (_least_turns(corners) < -1e-4 * size**4).any():
+            raise DataError(path, "concave polygons", "export it as triangles, or as .obj")
+
+
 def _count_from_beginning(text: str) -> str:
     """Return the text of an .obj file whose faces count back from their own line with positive numbers instead.
 
@@ -335,11 +372,7 @@ def _triangulate_obj(text: str) -> str:
     positions = np.array([line.split()[1:4] for line in vertices], np.float64)
     for rows in polygons.values():
         corners = positions[np.array([row for _, row in rows])]
-        edges = np.roll(corners, -1, axis=1) - corners
-        turns = np.cross(edges, np.roll(edges, -1, axis=1))
-        normals = np.cross(corners, np.roll(corners, -1, axis=1)).sum(axis=1, keepdims=True)
-        concave = ((turns * normals).sum(axis=-1) < 0).any(axis=1)
-        for i in np.flatnonzero(concave):
+        for i in np.flatnonzero(_least_turns(corners) < 0):
             number = rows[i][0]
             names = lines[number].split()[1:]
             triangles = (" ".join(names[k] for k in triangle) for triangle in triangulate(corners[i]))
