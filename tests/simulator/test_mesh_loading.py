@@ -185,6 +185,8 @@ TEXTURED = "v 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nf 1/1 2/1 3/1\n"
         ("a.ply", ply("0 1 2 3 4"), "concave polygons; export it as triangles"),
         ("a.ply", ply("0 1 2", "0 1 2 3 4"), "concave polygons; export it as triangles"),
         ("a.ply", ply("0 1 2 4", face="uchar red green blue"), "polygons with a color each; export it as triangles"),
+        ("a.obj", TRIANGLE.replace("0 0\n", "0 0 255 0 7\n"), "vertex colors above 1; divide them by 255"),
+        ("a.ply", ply("0 1 2", vertex="float red green blue").replace("0 0 0\n", "9 0 0\n"), "colors above 1; divide"),
         ("a.ply", ply("0 1 2", vertex="ushort red green blue"), "colors of 16 bits; export them with 8"),
         ("a.ply", PAINTED.format("comment TextureFile gone.png"), "gone.png: there is no such file"),
         ("a.ply", PAINTED.format("comment TextureFile e.png"), "e.png: not a picture"),

@@ -142,6 +142,9 @@ def _build_mesh(path: Path, content: bytes, y_up: bool, gloss: Mapping[str, Glos
         text = _count_from_beginning(text)
         if wrong := re.search(r"^f (?:.* )?([-0]\d*)", text, re.MULTILINE):
             raise DataError(path, f"a face has the vertex {wrong[1]}, but the first one is 1", _REMEDY)
+        painted = re.findall(r"^v(?: +\S+){3}((?: +[-+.\deE]+){3})", text, re.MULTILINE)
+        if painted and np.array(" ".join(painted).split(), np.float64).max() > 1:
+            raise DataError(path, "vertex colors above 1", "divide them by 255")
         content = _triangulate_obj(_with_texture_coordinates(text)).encode()
     files = _FilesBeside(path, libraries[0] if libraries else None)
     if suffix == ".ply":
@@ -167,7 +170,7 @@ def _build_mesh(path: Path, content: bytes, y_up: bool, gloss: Mapping[str, Glos
         raise DataError(path, "there is no surface in it", "give a mesh of triangles, not points or lines")
     if suffix == ".ply":
         for mesh, _ in placed:
-            _require_convex(path, mesh)
+            _require_plain_ply(path, mesh)
     names = [getattr(getattr(mesh.visual, "material", None), "name", None) or "" for mesh, _ in placed]
     for name in gloss:
         if name not in names:
@@ -303,10 +306,15 @@ def _least_turns(corners: Array) -> Array:
     return (turns * normals).sum(axis=-1).min(axis=1)
 
 
-def _require_convex(path: Path, mesh: Any) -> None:
-    """Raise a DataError if a .ply has a polygon that a fan of triangles, as trimesh makes it, does not fill."""
+def _require_plain_ply(path: Path, mesh: Any) -> None:
+    """Raise a DataError if a .ply has a polygon that a fan of triangles, as trimesh makes it, does not fill, or decimal
+    colors above 1, which trimesh clips."""
     elements = mesh.metadata["_ply_raw"]
-    points = np.column_stack([elements["vertex"]["data"][axis] for axis in "xyz"]).astype(np.float64)
+    corner = elements["vertex"]["data"]
+    colors = [corner[name] for name in ("red", "green", "blue") if name in elements["vertex"]["properties"]]
+    if any(column.dtype.kind == "f" and column.max() > 1 for column in colors):
+        raise DataError(path, "vertex colors above 1", "divide them by 255")
+    points = np.column_stack([corner[axis] for axis in "xyz"]).astype(np.float64)
     columns = elements["face"]["data"]
     names = [*(columns.dtype.names if isinstance(columns, np.ndarray) else columns)]
     polygons = columns[next((name for name in names if name in ("vertex_index", "vertex_indices")), names[0])]
