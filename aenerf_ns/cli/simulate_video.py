@@ -69,7 +69,7 @@ class SimulateVideo(SimulationCommand):
                 raise DataError(self.video, "there is no such video", "give a file, or a folder of images")
         for file in (self.trajectory, self.calibration):
             if file is not None:
-                require_file(file)
+                require_file(file, "check its name")
         with exclusive_output(self.output) as lock, value_errors_as_data_error(_COMMAND, f"see {_COMMAND} --help"):
             self._simulate(sensor, noise, lock)
 

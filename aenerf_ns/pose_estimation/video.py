@@ -14,7 +14,7 @@ import numpy as np
 from nerfstudio.utils.rich_utils import CONSOLE
 from numpy.typing import NDArray
 
-from aenerf_ns.errors import DataError, reading
+from aenerf_ns.errors import DataError, reading, require_file
 from aenerf_ns.files.limits import MAX_TIME
 from aenerf_ns.recording.images import open_image, read_image, require_8_bits
 from aenerf_ns.recording.views import IMAGE_LIST, read_image_list
@@ -89,6 +89,7 @@ def open_video(source: Path, frame_rate: float | None = None) -> Video:
 
 
 def _open_folder(source: Path) -> Video:
+    require_file(source / IMAGE_LIST, "write a line for each frame into it: time[s] file")
     images = read_image_list(source / IMAGE_LIST)
     if not images:
         raise DataError(source / IMAGE_LIST, "it lists no frames", "write a line for each: time[s] file")

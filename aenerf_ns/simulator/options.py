@@ -28,7 +28,7 @@ def require_scene_file(path: Path) -> None:
     if path.suffix.lower() not in (*MESH_SUFFIXES, BLENDER_SUFFIX, ".json"):
         remedy = "give a built-in scene, a .glb, .obj, .ply or .blend file, or a scene.json"
         raise DataError(path, "an unknown scene", remedy)
-    require_file(path)
+    require_file(path, "check its name")
 
 
 @dataclass(frozen=True)

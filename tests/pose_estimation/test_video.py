@@ -146,7 +146,7 @@ SMALLER, DEEP = np.zeros((HEIGHT, WIDTH - 1), np.uint8), np.zeros((HEIGHT, WIDTH
         (cut_file, "video.avi: (not a video that can be read|no frame of it can be decoded|[01] frames)"),
         (file_with(b"#EXTM3U\n#EXTINF:1,\nfile:///etc/passwd\n"), "video.mp4: not a video that can be read"),
         (lambda path: write_video(path / "video.avi", make_frames(1)), "video.avi: 1 frames; events happen between"),
-        (lambda path: path, "images.txt: there is no such file"),
+        (lambda path: path, "images.txt: there is no such file; write a line for each frame into it"),
         (folder_with([]), "images.txt: it lists no frames; write a line"),
         (folder_with(["0"]), "frames: 1 frames; events happen between"),
         (folder_with(["0", "2", "2"]), "frames: frame 2 is at 2000000000 ns, not after .* 2000000000 ns; sort"),

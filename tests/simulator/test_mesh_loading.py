@@ -204,7 +204,7 @@ TEXTURED = "v 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nf 1/1 2/1 3/1\n"
         ("a.obj", f"mtllib .\n{TRIANGLE}", "a.obj: "),
         ("a.obj", f"mtllib {'m' * 5000}\n{TRIANGLE}", "cannot be read"),
         ("a.obj", f"mtllib b.mtl\n{TRIANGLE}", "b.mtl: there is no such file"),
-        ("a.obj", f"mtllib c.mtl\n{TRIANGLE}", "c.png: there is no such file"),
+        ("a.obj", f"mtllib c.mtl\n{TRIANGLE}", "c.png: there is no such file; put it there"),
         ("a.obj", f"mtllib d.mtl\nmtllib d.mtl\n{TRIANGLE}", "2 material files"),
         ("a.obj", f"mtllib d.mtl\nusemtl c\n{TRIANGLE}", "no material 'c'"),
         ("a.obj", f"mtllib d.mtl\nusemtl \n{TRIANGLE}", "no material ''"),

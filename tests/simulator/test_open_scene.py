@@ -44,7 +44,7 @@ DAY = {"sky": [[0, 0, 0], [1, 1, 1]], "lamps": [LAMP]}
         ({"light": {**DAY, "gain": 2}}, "belong to an environment"),
         ({"light": {"sky": [[1, 1, 1], [1, 1, -1]]}}, "light.sky[1][2]: "),
         ({"light": {"sky": [[1] * 3, [1e300] * 3]}}, "light.sky[1][0]: "),
-        ({"light": {"environment": "gone.hdr"}}, "gone.hdr: there is no such file"),
+        ({"light": {"environment": "gone.hdr"}}, "gone.hdr: there is no such file; put it there"),
         ({"light": {"environment": "box.glb"}}, "box.glb: not a Radiance picture"),
         ({"light": {**DAY, "lamps": [LAMP] * 101}}, "light.lamps: "),
         ({"light": {**DAY, "lamps": [{**LAMP, "half_v": [0, 0, 0]}]}}, "span no rectangle"),

@@ -62,7 +62,7 @@ def load_environment(path: Path, turn_degrees: float = 0.0, gain: float = 1.0) -
     Raises:
         DataError: the file is missing or is not a panorama.
     """
-    require_file(path)
+    require_file(path, "put it there, or correct its name")
     with reading(path):
         require_at_most(path, _MAX_BYTES)
         with path.open("rb") as file:

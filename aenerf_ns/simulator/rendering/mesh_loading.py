@@ -58,7 +58,7 @@ def load_mesh(path: Path, y_up: bool, gloss: Mapping[str, Gloss] | None = None) 
 
 
 def _read(path: Path) -> bytes:
-    require_file(path)
+    require_file(path, "put it there, or correct its name")
     with reading(path):
         require_at_most(path, _MAX_BYTES)
         return path.read_bytes()
