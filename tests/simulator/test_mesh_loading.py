@@ -123,7 +123,7 @@ def test_obj_keeps_its_texture_beside_a_face_without_coordinates(tmp_path: Path)
     (tmp_path / "a.mtl").write_text("newmtl a\nmap_Kd a.png\n")
     Image.new("RGB", (2, 2)).save(tmp_path / "a.png")
     corners = "v 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0.2 0.3\nvn 0 0 1\n"
-    for bare in ("f 1 3 2", "f 1//1 3//1 2//1"):
+    for bare in ("f  1 3  2", "f 1//1 3//1 2//1"):
         (tmp_path / "a.obj").write_text(f"mtllib a.mtl\n{corners}usemtl a\nf 1/1/1 2/1/1 3/1/1\n{bare}\n")
         mesh = load_mesh(tmp_path / "a.obj", False)
         assert mesh.texture.tolist() == [0, 0]

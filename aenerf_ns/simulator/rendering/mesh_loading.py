@@ -356,8 +356,8 @@ def _with_texture_coordinates(text: str) -> str:
 
     trimesh drops the texture of a material if one of its faces has no coordinates.
     """
-    bare = re.compile(r"^f \d+(?: |//).*", re.MULTILINE)
-    if not bare.search(text) or not re.search(r"^f \d+/\d", text, re.MULTILINE):
+    bare = re.compile(r"^f +\d+(?: |//).*", re.MULTILINE)
+    if not bare.search(text) or not re.search(r"^f +\d+/\d", text, re.MULTILINE):
         return text
     last = len(re.findall(r"^vt ", text, re.MULTILINE)) + 1
     text = bare.sub(lambda line: re.sub(r" (\d+)\S*", rf" \1/{last}", line[0]), text)
