@@ -122,31 +122,37 @@ class _FilesBeside(trimesh.resolvers.FilePathResolver):
         return "\n".join(lines)
 
 
+def _read_obj(path: Path, content: bytes) -> tuple[bytes, str | None, set[str]]:
+    """Return an .obj file that trimesh reads as it is meant, its material file, and the materials that it uses."""
+    text = content.decode("utf-8-sig", errors="replace").replace("\r\n", "\n").replace("\\\n", " ")
+    # trimesh passes over lines that begin with a blank, or have tabs.
+    text = re.sub(r"^ +", "", text.replace("\t", " "), flags=re.MULTILINE)
+    libraries = [name.strip() for name in re.findall(r"^mtllib(.*)", text, re.MULTILINE)]
+    used = {name.strip() for name in re.findall(r"^usemtl(.*)", text, re.MULTILINE)}
+    if len(libraries) > 1:
+        raise DataError(path, f"{len(libraries)} material files", "join them into one")
+    # trimesh takes a comment behind a face for a corner.
+    text = re.sub(r"^(f [^#\n]*)#.*", r"\1", text, flags=re.MULTILINE)
+    text = _count_from_beginning(text)
+    if wrong := re.search(r"^f (?:.* )?([-0]\d*)", text, re.MULTILINE):
+        raise DataError(path, f"a face has the vertex {wrong[1]}, but the first one is 1", _REMEDY)
+    painted = re.findall(r"^v(?: +\S+){3}((?: +[-+.\deE]+){3})", text, re.MULTILINE)
+    if painted and np.array(" ".join(painted).split(), np.float64).max() > 1:
+        raise DataError(path, "vertex colors above 1", "divide them by 255")
+    content = _triangulate_obj(_with_texture_coordinates(text)).encode()
+    return content, libraries[0] if libraries else None, used
+
+
 def _build_mesh(path: Path, content: bytes, y_up: bool, gloss: Mapping[str, Gloss]) -> Mesh:
     """Build the mesh in the content of a file."""
     suffix = path.suffix.lower()
-    libraries: list[str] = []
+    library: str | None = None
     used: set[str] = set()
     if suffix == ".glb":
         _require_plain_glb(path, content)
     elif suffix == ".obj":
-        text = content.decode("utf-8-sig", errors="replace").replace("\r\n", "\n").replace("\\\n", " ")
-        # trimesh passes over lines that begin with a blank, or have tabs.
-        text = re.sub(r"^ +", "", text.replace("\t", " "), flags=re.MULTILINE)
-        libraries = [name.strip() for name in re.findall(r"^mtllib(.*)", text, re.MULTILINE)]
-        used = {name.strip() for name in re.findall(r"^usemtl(.*)", text, re.MULTILINE)}
-        if len(libraries) > 1:
-            raise DataError(path, f"{len(libraries)} material files", "join them into one")
-        # trimesh takes a comment behind a face for a corner.
-        text = re.sub(r"^(f [^#\n]*)#.*", r"\1", text, flags=re.MULTILINE)
-        text = _count_from_beginning(text)
-        if wrong := re.search(r"^f (?:.* )?([-0]\d*)", text, re.MULTILINE):
-            raise DataError(path, f"a face has the vertex {wrong[1]}, but the first one is 1", _REMEDY)
-        painted = re.findall(r"^v(?: +\S+){3}((?: +[-+.\deE]+){3})", text, re.MULTILINE)
-        if painted and np.array(" ".join(painted).split(), np.float64).max() > 1:
-            raise DataError(path, "vertex colors above 1", "divide them by 255")
-        content = _triangulate_obj(_with_texture_coordinates(text)).encode()
-    files = _FilesBeside(path, libraries[0] if libraries else None)
+        content, library, used = _read_obj(path, content)
+    files = _FilesBeside(path, library)
     if suffix == ".ply":
         header = content.partition(b"end_header")[0].decode("utf-8", errors="replace")
         pictures = re.findall(r"^comment +TextureFile +(.*)", header, re.MULTILINE | re.IGNORECASE)
@@ -160,7 +166,7 @@ def _build_mesh(path: Path, content: bytes, y_up: bool, gloss: Mapping[str, Glos
     scene = trimesh.load_scene(BytesIO(content), file_type=suffix[1:], resolver=files, process=False)
     if files.errors:
         raise files.errors[0]
-    if libraries and used - files.materials:
+    if library is not None and used - files.materials:
         raise DataError(path, f"no material {min(used - files.materials)!r}", "add it to the material file")
     # trimesh makes a part of each material of an .obj file, in reversed order.
     nodes = list(scene.graph.nodes_geometry)[:: -1 if suffix == ".obj" else 1]
