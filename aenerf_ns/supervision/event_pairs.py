@@ -261,10 +261,7 @@ class PairSamplerConfig(SamplerConfig):
     """The most events of its pixel that a pair spans, up to 255. 1: consecutive events, as in the paper."""
     silent_pair_share: float = 0.25
     """Share of the pairs of a batch that end at a random moment at a random pixel, between two events. The others end
-    at an event. 0: all of them, as in the paper."""
-    even_pair_share: float = 0.0
-    """Share of the pairs of a batch that end at the event after a random moment at a random pixel. What is left of the
-    batch ends at random events. 0: all pairs that end at events, as in the paper."""
+    at a random event. 0: all of them, as in the paper."""
 
 
 class PairSampler(Sampler):
@@ -272,7 +269,7 @@ class PairSampler(Sampler):
 
     A pair's later event is drawn uniformly, as in the paper. Events are where the edges are, so a pair may instead end
     at a uniform moment at a uniform pixel, between two events: since the first of the two, log-radiance has changed by
-    less than a contrast threshold. Or it ends at the second of these two, where the change is known.
+    less than a contrast threshold.
 
     How many events of its pixel a pair spans is drawn from 1 to ``max_events_per_pair`` with log-uniform probability:
     1 is the paper's pair of consecutive events (eq. 4). Consecutive events tell where an edge is, but little of how the
@@ -307,7 +304,6 @@ class PairSampler(Sampler):
         super().__init__(config, dataset, supervision, device)
         self.require_between(1, MAX_SPAN, "max_events_per_pair")
         self.require_between(0, 1, "silent_pair_share")
-        self.require_between(0, 1 - config.silent_pair_share, "even_pair_share")
         consecutive = supervision.config.learn_refractory_period
         self._max_events_per_pair = 1 if consecutive else config.max_events_per_pair
         self._silent_pair_share = 0.0 if consecutive else config.silent_pair_share
@@ -342,8 +338,7 @@ class PairSampler(Sampler):
         num_pairs = max(num_rays // (3 if with_time_within else 2), 1)
         device = self.pixel_rays.channels.device
         num_silent = round(self._silent_pair_share * num_pairs)
-        num_moments = min(num_silent + round(self.config.even_pair_share * num_pairs), num_pairs)
-        rows, spans = self._table.draw(num_moments, num_pairs - num_moments, self._max_events_per_pair)
+        rows, spans = self._table.draw(num_silent, num_pairs - num_silent, self._max_events_per_pair)
         times, packed = rows.permute(3, 2, 1, 0)
         # Of the first event, of the event before the last one, and of the last one.
         first, before, last = packed[1, 0], packed[0, 1], packed[1, 1]
