@@ -94,6 +94,15 @@ def test_obj_vertex_colors_beside_a_material(tmp_path: Path) -> None:
     np.testing.assert_allclose(mesh.color[mesh.faces], [[[0.5, float(decode(np.array(0.5), "srgb")), 0]] * 3])
 
 
+def test_obj_vertex_colors_without_a_color_of_a_material(tmp_path: Path) -> None:
+    (tmp_path / "a.mtl").write_text("newmtl a\nKs 1 1 1\n")
+    corners = "v 0 0 0 1 0 0\nv 1 0 0 1 0 0\nv 0 1 0 1 0 0\nvt 0 0\n"
+    for named in ("", "mtllib a.mtl\nusemtl a\n"):
+        (tmp_path / "a.obj").write_text(f"{corners}{named}f 1/1 2/1 3/1\n")
+        mesh = load_mesh(tmp_path / "a.obj", False)
+        np.testing.assert_allclose(mesh.color[mesh.faces], [[[1, 0, 0]] * 3])
+
+
 def test_colors_of_unusual_material_files(tmp_path: Path) -> None:
     materials = "\ufeffnewmtl a\nKd 0.2 0.3 0.4 # blue\nKs 0.5\nnewmtl b\nKd 0.6\n"
     (tmp_path / "a.mtl").write_text(materials, encoding="utf-8")
@@ -131,8 +140,8 @@ def test_obj_keeps_its_texture_beside_a_face_without_coordinates(tmp_path: Path)
         assert mesh.vertices[mesh.faces[1]].tolist() == [[0, 0, 0], [0, 1, 0], [1, 0, 0]]
 
 
-def test_obj_with_tabs_and_a_byte_order_mark(tmp_path: Path) -> None:
-    (tmp_path / "a.obj").write_text("\ufeffv\t0 0 0\n\tv 2\t0 0\nv\t0 2 0\nf\t1\t2 3\n", encoding="utf-8")
+def test_obj_with_tabs_leading_zeros_and_a_byte_order_mark(tmp_path: Path) -> None:
+    (tmp_path / "a.obj").write_text("\ufeffv\t0 0 0\n\tv 2\t0 0\nv\t0 2 0\nf\t01\t02 03\n", encoding="utf-8")
     mesh = load_mesh(tmp_path / "a.obj", False)
     assert mesh.vertices[mesh.faces].tolist() == [[[0, 0, 0], [2, 0, 0], [0, 2, 0]]]
 
@@ -199,6 +208,8 @@ TEXTURED = "v 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nf 1/1 2/1 3/1\n"
         ("a.obj", TRIANGLE.replace("0 1 0", "2 0 0"), "no face has an area"),
         ("a.obj", TRIANGLE.replace("0 1 0", "0 nan 0"), "not finite"),
         ("a.obj", TRIANGLE.replace("v 1", "v inf"), "not finite"),
+        ("a.obj", TRIANGLE.replace("v 1", "v inf").replace("1 2 3", "1 2 3 1"), "not finite"),
+        ("a.ply", ply("0 1 2 4").replace("2 2 0", "inf 2 0"), "not finite"),
         ("a.obj", TRIANGLE.replace("v ", "v 40000"), "too far from the origin for its size of 1.41; move it"),
         ("a.obj", f"mtllib \n{TRIANGLE}", "a.obj: "),
         ("a.obj", f"mtllib .\n{TRIANGLE}", "a.obj: "),

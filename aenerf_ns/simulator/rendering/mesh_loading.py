@@ -134,7 +134,7 @@ def _read_obj(path: Path, content: bytes) -> tuple[bytes, str | None, set[str]]:
     # trimesh takes a comment behind a face for a corner.
     text = re.sub(r"^(f [^#\n]*)#.*", r"\1", text, flags=re.MULTILINE)
     text = _count_from_beginning(text)
-    if wrong := re.search(r"^f (?:.* )?([-0]\d*)", text, re.MULTILINE):
+    if wrong := re.search(r"^f (?:.* )?(-\d+|0+\b)", text, re.MULTILINE):
         raise DataError(path, f"a face has the vertex {wrong[1]}, but the first one is 1", _REMEDY)
     painted = re.findall(r"^v(?: +\S+){3}((?: +[-+.\deE]+){3})", text, re.MULTILINE)
     if painted and np.array(" ".join(painted).split(), np.float64).max() > 1:
@@ -221,11 +221,12 @@ def _build_part(
     elif visual.kind == "vertex":
         color = _linear_colors(visual.vertex_colors, is_gltf)
     elif visual.kind == "texture":
-        factor, image = _base_color(visual.material)
-        color = np.tile(factor, (len(vertices), 1))
         # trimesh keeps the colors of a .glb with its materials, and those of an .obj with its vertices.
         painted = visual.vertex_attributes.get("color", mesh.vertex_attributes.get("color"))
-        if painted is not None and len(painted) == len(vertices):
+        is_painted = painted is not None and len(painted) == len(vertices)
+        factor, image = _base_color(visual.material, is_painted)
+        color = np.tile(factor, (len(vertices), 1))
+        if is_painted:
             color = color * _linear_colors(painted, is_gltf)
         if image is not None and visual.uv is not None and len(visual.uv) == len(vertices):
             uv = np.asarray(visual.uv, np.float64)[:, :2]
@@ -247,8 +248,11 @@ def _build_part(
     return moved, faces, uv, color, np.full(len(faces), index)
 
 
-def _base_color(material: Any) -> tuple[Array, Any]:
-    """Return the linear color factor (3,) and the picture, or None, of a material."""
+def _base_color(material: Any, is_painted: bool) -> tuple[Array, Any]:
+    """Return the linear color factor (3,) and the picture, or None, of a material.
+
+    Without either, the factor is that of an uncolored surface, or 1 where vertices have colors (``is_painted``).
+    """
     if hasattr(material, "baseColorTexture"):
         factor = material.baseColorFactor
         return (np.ones(3) if factor is None else np.asarray(factor)[:3] / 255.0), material.baseColorTexture
@@ -259,7 +263,7 @@ def _base_color(material: Any) -> tuple[Array, Any]:
         image = None
     if factor is not None and np.size(factor) == 3:
         return np.asarray(factor, np.float64), image
-    return np.full(3, _UNCOLORED if image is None else 1.0), image
+    return np.full(3, 1.0 if is_painted or image is not None else _UNCOLORED), image
 
 
 def _linear_colors(values: Any, is_linear: bool) -> Array:
@@ -306,10 +310,12 @@ def _least_turns(corners: Array) -> Array:
 
     A turn is the sine of its angle, times the adjacent sides, times twice the polygon's area.
     """
-    edges = np.roll(corners, -1, axis=1) - corners
-    turns = np.cross(edges, np.roll(edges, -1, axis=1))
-    normals = np.cross(corners, np.roll(corners, -1, axis=1)).sum(axis=1, keepdims=True)
-    return (turns * normals).sum(axis=-1).min(axis=1)
+    # Infinite vertices are refused later, where the whole mesh is known.
+    with np.errstate(invalid="ignore", over="ignore"):
+        edges = np.roll(corners, -1, axis=1) - corners
+        turns = np.cross(edges, np.roll(edges, -1, axis=1))
+        normals = np.cross(corners, np.roll(corners, -1, axis=1)).sum(axis=1, keepdims=True)
+        return (turns * normals).sum(axis=-1).min(axis=1)
 
 
 def _require_plain_ply(path: Path, mesh: Any) -> None:
