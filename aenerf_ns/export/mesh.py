@@ -22,7 +22,7 @@ _MAX_BEYOND = 0.01
 _TRUNCATION = 4.0
 # Voxels along a side of a block, and blocks that memory is taken for at first: 0.4 GB.
 _BLOCK, _NUM_BLOCKS = 8, 40_000
-# More views than this must have seen a surface.
+# Open3D keeps what more views than this have seen.
 _MIN_VIEWS = 1.0
 
 

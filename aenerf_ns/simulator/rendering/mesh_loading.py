@@ -100,8 +100,10 @@ class _FilesBeside(trimesh.resolvers.FilePathResolver):
         return content
 
     def _read_materials(self, path: Path, text: str) -> str:
-        """Return the lines of a material file that are used. trimesh drops a color with a comment, and all materials
-        because of another line that it does not expect."""
+        """Return the lines of a material file that are used.
+
+        trimesh drops a color with a comment, and all materials because of another line that it does not expect.
+        """
         lines = []
         for line in text.splitlines():
             key, _, value = line.strip().replace("\t", " ").partition(" ")
@@ -319,8 +321,10 @@ def _least_turns(corners: Array) -> Array:
 
 
 def _require_plain_ply(path: Path, mesh: Any) -> None:
-    """Raise a DataError if a .ply has a polygon that a fan of triangles, as trimesh makes it, does not fill, or decimal
-    colors above 1, which trimesh clips."""
+    """Raise a DataError if a .ply has concave polygons, or decimal colors above 1.
+
+    trimesh makes fans of polygons, which fill convex ones alone, and clips the colors.
+    """
     elements = mesh.metadata["_ply_raw"]
     corner = elements["vertex"]["data"]
     colors = [corner[name] for name in ("red", "green", "blue") if name in elements["vertex"]["properties"]]
