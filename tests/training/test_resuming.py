@@ -194,8 +194,13 @@ def test_a_training_that_is_asked_to_stop_while_it_is_set_up_stops_at_once(
 ) -> None:
     # While the events are read, which may take minutes.
     monkeypatch.setattr(EventDataManager, "supervise", lambda *_: os.kill(os.getpid(), signal.SIGINT))
-    with pytest.raises(SystemExit) as stopped:
-        train_small_model(tmp_path, "asked", 12)
+    # Commands that a shell starts in the background ignore the signal, and so would the tests.
+    previous = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        with pytest.raises(SystemExit) as stopped:
+            train_small_model(tmp_path, "asked", 12)
+    finally:
+        signal.signal(signal.SIGINT, previous)
     assert stopped.value.code == 128 + signal.SIGINT
     assert capsys.readouterr().out.endswith("\nStopped.\n")
 
