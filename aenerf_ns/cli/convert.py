@@ -123,7 +123,7 @@ class Convert(DatasetCommand):
         report = picture = None
         if has_given_poses:
             recording = parser.recording
-            # For its errors.
+            # Called for its errors: events that are missing, or fit the poses in another unit of time alone.
             parser.event_span(recording, self.start_time_ns, self.end_time_ns)
             if self.poses == "refined":
                 recording, report, picture = self._with_refined_poses(parser, recording, filters.window)
