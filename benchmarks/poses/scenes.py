@@ -67,6 +67,7 @@ SCENES = {
         ("plants", "report", "plants", "easy", "color, fine structures", f"{_SMALL} {_NOISE} {_RGGB} --seed 12"),
         ("workshop", "report", "workshop", "hard", "a large place", f"{_SMALL} {_NOISE} --seed 13"),
         ("gallery", "report", "gallery", "easy", "a long place, slow noise", f"{_SMALL} {_SLOW_NOISE} --seed 14"),
+        ("room easy", "report", "room", "easy", "seen from within, slowly", f"{_SMALL} {_NOISE} --seed 5"),
         ("room large noise", "report", "room", "easy", "large noise, middle size",
          f"{_MIDDLE} {_LARGE_NOISE} --seed 15"),
         ("object large noise", "events", "object", "hard", "large noise, middle size",
