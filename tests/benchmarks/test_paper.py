@@ -140,10 +140,7 @@ def test_name_tells_runs_apart() -> None:
             "tiny_methods",
             {"methods": ("aenerf", "robust-enerf", "eventnerf", "evnerf", "paev3d"), "seeds": (42,), "steps": 400},
         ),
-        (
-            "tiny_methods_seed43",
-            {"methods": ("aenerf", "eventnerf", "evnerf"), "seeds": (43,), "speeds": ("hard",), "steps": 400},
-        ),
+        ("tiny_methods_seed43", {"methods": ("aenerf", "eventnerf", "evnerf"), "seeds": (43,), "steps": 400}),
     ],
 )
 def test_published_runs_and_tables_are_made_again(folder: str, options: dict[str, Any]) -> None:
@@ -151,8 +148,7 @@ def test_published_runs_and_tables_are_made_again(folder: str, options: dict[str
     names = ("forklift", "gallery", "games", "living_room", "lounge", "workshop")
     scenes = [f"scenes/{name}/scene.json" for name in names]
     runs = small_plan(scenes=scenes, tables=("methods",), **options)
-    num_speeds = len(options.get("speeds", ("easy", "hard")))
-    num_runs = 6 * num_speeds * 3 * len(options["methods"]) * len(options["seeds"])
+    num_runs = 6 * 2 * 3 * len(options["methods"]) * len(options["seeds"])
     assert len({run.name for run in runs}) == len(runs) == num_runs
     # Registered under these names, and corrected by the same spline as ours.
     assert all_methods.keys() >= {run.method for run in runs}
