@@ -56,7 +56,7 @@ class FrameChanges:
         self._gray_levels: dict[int, NDArray[np.uint8]] = {}
         for time in self._moments.tolist():
             check_image(files[time], capture.event_camera)
-            self._gray_levels[time] = np.asarray(read_image(files[time]).convert("L"))
+            self._gray_levels[time] = _levels_of_pixels(files[time], capture.sensor)
 
     def add(self, events: EventStream, weights: NDArray[np.float64]) -> None:
         """Add a piece of the stream of events. The (N,) weights say for how many thresholds each event stands."""
@@ -124,6 +124,15 @@ class FrameChanges:
             events = ratio * positive - negative
             changes.append(np.stack([events[seen], log[1] - log[0], lag[1] - lag[0], rate[1] - rate[0]]))
         return np.concatenate(changes, 1)
+
+
+def _levels_of_pixels(file: Path, sensor: SensorModel) -> NDArray[np.uint8]:
+    """Read the (height, width) gray levels of an image; of a color sensor, those behind the filter of each pixel."""
+    image = read_image(file)
+    if not sensor.bayer_pattern:
+        return np.asarray(image.convert("L"))
+    channels = sensor.channels(image.width, image.height)
+    return np.take_along_axis(np.asarray(image.convert("RGB")), channels[..., None], -1)[..., 0]
 
 
 def _robust_fit(columns: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -53,3 +53,20 @@ def test_frames_tell_the_bandwidth(tmp_path: Path, bandwidth: float | None) -> N
         value, low, high = found
         assert low <= value <= high
         assert value == pytest.approx(simulator.recorded_sensor().bandwidth, rel=0.2)
+
+
+def test_a_pixel_of_a_color_sensor_is_compared_with_its_own_channel(tmp_path: Path) -> None:
+    # Red becomes brighter by a quarter, and blue darker. A pixel of either fires for the change behind its filter.
+    before = np.full((HEIGHT, WIDTH, 3), (100, 100, 125), np.uint8)
+    frames = [(0, tmp_path / "0.png"), (1_000_000, tmp_path / "1.png")]
+    for (_, file), picture in zip(frames, (before, before[..., ::-1]), strict=True):
+        Image.fromarray(np.ascontiguousarray(picture)).save(file)
+    camera, sensor = CameraIntrinsics(WIDTH, HEIGHT, 40.0, 40.0, 20.0, 15.0), SensorModel(0.1, 0.1, 0, "RGGB")
+    capture = SimpleNamespace(sensor=sensor, event_camera=camera, frame_camera=camera, image_encoding="linear")
+    changes = FrameChanges(capture, frames, TimeWindow())
+    rows, columns = np.nonzero(sensor.channels(WIDTH, HEIGHT) != 1)
+    polarities = (1 - sensor.channels(WIDTH, HEIGHT)[rows, columns]).astype(np.int8)
+    x, y = columns.astype(np.uint16), rows.astype(np.uint16)
+    changes.add(EventStream(x, y, np.full(len(x), 500_000), polarities, WIDTH, HEIGHT), np.ones(len(x)))
+    assert changes.correlation() == pytest.approx(1)
+    assert changes.negative_threshold(1.0)[0] == pytest.approx(np.log(1.25), rel=0.05)
