@@ -25,7 +25,13 @@ from aenerf_ns.recording.options import EventDataParserConfig
 from aenerf_ns.recording.recording import Capture, Recording, Split
 from aenerf_ns.recording.scene import SCENE_KEY, SceneRecording
 from aenerf_ns.recording.time_units import require_one_unit
-from aenerf_ns.recording.views import seconds_on_trajectory, thin_views, viewer_cameras, views_within
+from aenerf_ns.recording.views import (
+    require_distinct_times,
+    seconds_on_trajectory,
+    thin_views,
+    viewer_cameras,
+    views_within,
+)
 
 # Extents of the trajectory. Nerfstudio's cameras are float32: further out they would be rounded by a pixel and more.
 _MAX_REFERENCE_DISTANCE = 1e4
@@ -86,9 +92,10 @@ class EventDataParser(DataParser):
         with reading(self.data):
             if self._lacks_poses():
                 capture, frames = self.read_capture()
+                require_distinct_times([time for time, _ in frames], self.data)
                 capture.event_file.drop_malformed = self.config.drop_malformed
                 self._check_lens(capture.event_camera, "event camera")
-                return capture, frames
+                return capture, sorted(frames)
         return self._recording, self._recording.frames
 
     @property

@@ -251,6 +251,19 @@ def test_refuse_a_colmap_model_that_does_not_fit_the_images(placed: Truth) -> No
         opened(placed)
 
 
+def test_frames_of_a_recording_without_poses_are_in_the_order_of_time(truth: Truth) -> None:
+    frames = opened(truth).frames
+    (truth.data / "trajectory.txt").unlink()
+    listed = truth.data / "images.txt"
+    lines = listed.read_text().splitlines(keepends=True)
+    listed.write_text("".join(lines[::-1]))
+    parser = OwnRecordingDataParserConfig(data=truth.data).setup()
+    assert parser.read_frames()[1][: len(frames)] == frames
+    listed.write_text("".join(f"7.5 {line.split()[1]}\n" for line in lines))
+    with pytest.raises(DataError, match=r"several images are at 7\.500000000 s; give each image its own time"):
+        parser.read_frames()
+
+
 def test_refuse_many_images_at_one_time_quickly(tmp_path: Path) -> None:
     many = [(min(time, 99_998), tmp_path) for time in range(100_000)]
     with pytest.raises(DataError, match=r"several images are at 0\.000099998 s"):
