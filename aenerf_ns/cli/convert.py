@@ -168,7 +168,7 @@ class Convert(DatasetCommand):
         has_own_frames = capture.frame_camera == capture.event_camera
         if self.poses == "events":
             found = estimate_poses_from_events(capture, window, self.data, self.seed, self.weights, self._colmap_folder)
-            return _with_poses(found, capture, images if has_own_frames else [])
+            return _with_poses(found, capture, images)
         if not has_own_frames:
             raise DataError(
                 self.data,
@@ -305,6 +305,10 @@ def _with_poses(
             f"{trajectory.start} to {trajectory.end} ns: they are left out."
         )
     placed = [(time, file) for time, file in images if trajectory.start <= time <= trajectory.end]
+    if placed and capture.frame_camera != capture.event_camera:
+        # In a world without scale, nothing tells how far one camera is from the other.
+        say("The recording's images are left out: they are of another camera than the events.")
+        placed = []
     views = views_on_trajectory(placed, trajectory)
     camera = {field.name: getattr(capture, field.name) for field in fields(Capture)}
     recording = Recording(**camera, **new, reference_views=views, max_views=MAX_VIEWS)

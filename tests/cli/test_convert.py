@@ -210,16 +210,36 @@ def test_poses_from_frames_replace_the_given_ones(tmp_path: Path, monkeypatch: p
         convert(data, tmp_path / "given", format="ecd-data")
 
 
-def test_given_poses_of_another_time_are_left_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def find_three_poses(monkeypatch: pytest.MonkeyPatch, first: int) -> None:
+    """Let poses from events be found at three times, from a first one in nanoseconds on."""
     place_frames(3, monkeypatch)
 
     def estimate(capture: Capture, window: TimeWindow, source: Path, seed: int, *_: object) -> EstimatedPoses:
-        times = [50_000_000, 150_000_000, 250_000_000]
+        times = [first, first + 100_000_000, first + 200_000_000]
         found = from_frames.estimate_poses([source] * 3, times, capture.event_camera, source, seed)
         # Two images in a row are lost, where one may be.
-        return replace(found, frame_times=np.array([*times[:2], 160_000_000, 170_000_000, times[2]]), max_lost=1)
+        lost = [times[1] + 10_000_000, times[1] + 20_000_000]
+        return replace(found, frame_times=np.array([*times[:2], *lost, times[2]]), max_lost=1)
 
     monkeypatch.setattr("aenerf_ns.pose_estimation.from_events.estimate_poses_from_events", estimate)
+
+
+def test_images_of_another_camera_are_left_out_of_poses_from_events(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    find_three_poses(monkeypatch, START)
+    data = write_native(tmp_path / "made")
+    set_in("transforms.json", "fl_x", value=4.0)(data)
+    for name in ("estimated", "ground_truth"):
+        (data / f"trajectory_{name}.txt").unlink()
+    with CONSOLE.capture() as output:
+        found = convert(data, tmp_path / "found", poses="events")
+    assert "The recording's images are left out: they are of another camera than the events." in output.get()
+    assert not any(found.reference_views.values())
+
+
+def test_given_poses_of_another_time_are_left_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    find_three_poses(monkeypatch, 50_000_000)
     data = write_ecd(tmp_path / "made")
     given = read_tum_trajectory(data / "groundtruth.txt")
     write_tum_trajectory(data / "groundtruth.txt", Trajectory(given.times + 10**12, given.camera_to_worlds))
