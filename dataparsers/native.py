@@ -77,6 +77,7 @@ class NativeDataParser(EventDataParser):
         if meta.event_camera.file is None:
             raise DataError(path, "event_camera: missing field file", "name the file of the events there")
         events = file_inside(path.parent, meta.event_camera.file, path)
+        mount = meta.event_camera.T_frame_event
         capture = Capture(
             event_file=Hdf5EventFile(events, camera.width, camera.height),
             event_camera=camera,
@@ -85,6 +86,7 @@ class NativeDataParser(EventDataParser):
             image_encoding=meta.image_encoding,
             intrinsics_origin=meta.event_camera.intrinsics_origin,
             has_assumed_thresholds=meta.event_camera.has_assumed_thresholds and not states_thresholds(self.config),
+            frame_from_event=None if mount is None else rigid_motion(path, "event_camera.T_frame_event", mount),
         )
         return path, meta, capture
 

@@ -131,6 +131,7 @@ class OwnRecordingDataParser(EventDataParser):
             frame_camera=calibration.frame_camera,
             image_encoding=config.image_encoding or calibration.image_encoding,
             intrinsics_origin=calibration.intrinsics_origin,
+            frame_from_event=calibration.frame_from_event,
         )
         return capture, calibration.frame_from_event, timed
 

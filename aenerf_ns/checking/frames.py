@@ -41,7 +41,7 @@ class FrameChanges:
 
     def __init__(self, capture: Capture, frames: Iterable[tuple[int, Path]], window: TimeWindow) -> None:
         files = {time: file for time, file in frames if window.contains(time)}
-        times = sorted(files) if capture.frame_camera == capture.event_camera else []
+        times = sorted(files) if capture.has_own_frames else []
         starts = np.unique(np.linspace(0, len(times) - 2, _MAX_PAIRS).astype(int)) if len(times) > 1 else []
         self._spans = [(times[i], times[i + 1]) for i in starts]
         self._encoding = capture.image_encoding

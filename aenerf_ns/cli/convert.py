@@ -115,8 +115,7 @@ class Convert(DatasetCommand):
             problem = f"a region of interest from pixel {self.region[0]} {self.region[1]} of a color sensor"
             remedy = "begin it at an even column and row, so that the Bayer pattern begins there as on the whole sensor"
             raise DataError("aenerf convert", problem, remedy)
-        has_own_frames = capture.frame_camera == capture.event_camera
-        if self.poses == "refined" or (self.poses == "events" and has_own_frames):
+        if self.poses == "refined" or (self.poses == "events" and capture.has_own_frames):
             for time, file in images:
                 if filters.window.contains(time):
                     check_image(file, capture.frame_camera)
@@ -137,7 +136,9 @@ class Convert(DatasetCommand):
         camera = recording.event_camera
         if self.region is not None:
             camera = camera.crop(*self.region)
-        with open_writer(lock, parser, recording, camera, recording.frame_camera, has_given_poses) as writer:
+        mount = None if recording.has_own_frames else recording.frame_from_event
+        cameras = (camera, recording.frame_camera, mount)
+        with open_writer(lock, parser, recording, *cameras, has_given_poses) as writer:
             writer.add_trajectories(trajectory, recording.ground_truth)
             if report is None:
                 writer.copy_poses_report(trajectory)
@@ -165,11 +166,10 @@ class Convert(DatasetCommand):
         from aenerf_ns.pose_estimation.from_frames import estimate_poses
         from aenerf_ns.recording.views import require_seconds
 
-        has_own_frames = capture.frame_camera == capture.event_camera
         if self.poses == "events":
             found = estimate_poses_from_events(capture, window, self.data, self.seed, self.weights, self._colmap_folder)
             return _with_poses(found, capture, images)
-        if not has_own_frames:
+        if not capture.has_own_frames:
             raise DataError(
                 self.data,
                 "its frames are of another camera than its events, and COLMAP finds the poses of the frames only",
@@ -305,10 +305,10 @@ def _with_poses(
             f"{trajectory.start} to {trajectory.end} ns: they are left out."
         )
     placed = [(time, file) for time, file in images if trajectory.start <= time <= trajectory.end]
-    if placed and capture.frame_camera != capture.event_camera:
+    if placed and not capture.has_own_frames:
         # In a world without scale, nothing tells how far one camera is from the other.
         say("The recording's images are left out: they are of another camera than the events.")
-        placed = []
+        placed, capture = [], replace(capture, frame_from_event=None)
     views = views_on_trajectory(placed, trajectory)
     camera = {field.name: getattr(capture, field.name) for field in fields(Capture)}
     recording = Recording(**camera, **new, reference_views=views, max_views=MAX_VIEWS)

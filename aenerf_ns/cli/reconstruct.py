@@ -124,7 +124,7 @@ def _add_reference_views(recording: Recording, writer: NativeDatasetWriter) -> N
 
     views = views_to_copy(recording, TimeWindow())
     del views["train"]
-    if recording.frame_camera != recording.event_camera:
+    if not recording.has_own_frames:
         if any(views.values()):
             say("The recording's images are left out: they are of another camera than the events.")
         return

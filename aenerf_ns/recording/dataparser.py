@@ -299,7 +299,7 @@ class EventDataParser(DataParser):
 
 def _frames(recording: Recording, window: TimeWindow) -> tuple[tuple[int, Path], ...]:
     """Return times and files of the training images that were taken in a time window, by the event camera."""
-    if recording.frame_camera != recording.event_camera:
+    if not recording.has_own_frames:
         return ()
     views = recording.reference_views["train"]
     return tuple((view.time, view.file) for view in views if view.time is not None and window.contains(view.time))

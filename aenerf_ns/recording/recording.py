@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
+import torch
 from torch import Tensor
 
 from aenerf_ns.camera.image_encoding import ImageEncoding
@@ -49,6 +50,8 @@ class Capture:
         has_assumed_thresholds: whether neither the dataset nor an option states the contrast thresholds.
         intrinsics_origin: where the event camera's lens comes from. A guessed one has to be estimated together with the
             poses.
+        frame_from_event: (4, 4) float64, takes points from the event camera's to the frame camera's coordinates, where
+            the dataset states it.
     """
 
     event_file: EventFile
@@ -58,6 +61,14 @@ class Capture:
     image_encoding: ImageEncoding
     has_assumed_thresholds: bool = field(default=False, kw_only=True)
     intrinsics_origin: Origin = field(default="given", kw_only=True)
+    frame_from_event: Tensor | None = field(default=None, kw_only=True)
+
+    @property
+    def has_own_frames(self) -> bool:
+        """Whether the images are of the event camera's own lens. Two cameras of one kind may share nominal values."""
+        motion = self.frame_from_event
+        is_apart = motion is not None and not torch.equal(motion, torch.eye(4).to(motion))
+        return self.frame_camera == self.event_camera and not is_apart
 
 
 @dataclass(frozen=True)

@@ -101,6 +101,7 @@ class NativeDatasetWriter(_FolderWriter):
         event_camera, sensor, image_encoding, max_pose_gap: see :class:`~aenerf_ns.recording.recording.Recording`.
         scene_box: (2, 3) corners of a box that holds the scene, or None for a scene without bounds.
         frame_camera: the lens of the camera that took the images; by default the event camera's.
+        frame_from_event: see :class:`~aenerf_ns.recording.recording.Capture`.
         auto_scale_poses: whether training scales the poses by default.
         has_estimated_intrinsics: whether the event camera's lens was estimated together with the poses.
         has_assumed_thresholds: whether nobody states the contrast thresholds.
@@ -118,6 +119,7 @@ class NativeDatasetWriter(_FolderWriter):
         auto_scale_poses: bool = True,
         has_estimated_intrinsics: bool = False,
         has_assumed_thresholds: bool = False,
+        frame_from_event: Tensor | None = None,
     ) -> None:
         super().__init__(folder, sensor)
         self._camera = event_camera
@@ -136,6 +138,8 @@ class NativeDatasetWriter(_FolderWriter):
             self._meta["event_camera"]["intrinsics_origin"] = "estimated"
         if has_assumed_thresholds:
             self._meta["event_camera"]["has_assumed_thresholds"] = True
+        if frame_from_event is not None:
+            self._meta["event_camera"]["T_frame_event"] = frame_from_event.tolist()
         if not auto_scale_poses:
             self._meta["auto_scale_poses"] = False
         if scene_box is not None:

@@ -40,7 +40,7 @@ def test_frames_tell_the_bandwidth(tmp_path: Path, bandwidth: float | None) -> N
             frames.append((1_000_000 * millisecond, tmp_path / f"{millisecond}.png"))
             Image.fromarray(levels).save(frames[-1][1])
     camera = CameraIntrinsics(WIDTH, HEIGHT, 40.0, 40.0, 20.0, 15.0)
-    capture = SimpleNamespace(sensor=sensor, event_camera=camera, frame_camera=camera, image_encoding="srgb")
+    capture = SimpleNamespace(sensor=sensor, event_camera=camera, has_own_frames=True, image_encoding="srgb")
     changes = FrameChanges(capture, frames, TimeWindow())
     events = EventStream(*map(np.concatenate, zip(*columns, strict=True)), WIDTH, HEIGHT)
     for chunk in (events[:3000], events[3000:]):
@@ -62,7 +62,7 @@ def test_a_pixel_of_a_color_sensor_is_compared_with_its_own_channel(tmp_path: Pa
     for (_, file), picture in zip(frames, (before, before[..., ::-1]), strict=True):
         Image.fromarray(np.ascontiguousarray(picture)).save(file)
     camera, sensor = CameraIntrinsics(WIDTH, HEIGHT, 40.0, 40.0, 20.0, 15.0), SensorModel(0.1, 0.1, 0, "RGGB")
-    capture = SimpleNamespace(sensor=sensor, event_camera=camera, frame_camera=camera, image_encoding="linear")
+    capture = SimpleNamespace(sensor=sensor, event_camera=camera, has_own_frames=True, image_encoding="linear")
     changes = FrameChanges(capture, frames, TimeWindow())
     rows, columns = np.nonzero(sensor.channels(WIDTH, HEIGHT) != 1)
     polarities = (1 - sensor.channels(WIDTH, HEIGHT)[rows, columns]).astype(np.int8)

@@ -295,9 +295,16 @@ def test_the_report_on_poses_stays_with_them(tmp_path: Path) -> None:
         assert (tmp_path / "twice" / name).read_bytes() == (data / name).read_bytes()
 
 
-def test_frames_of_another_camera_give_no_poses(tmp_path: Path) -> None:
+SHIFT = [[1, 0, 0, 0.1], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
+
+
+# Two cameras of one kind may have the same lens.
+@pytest.mark.parametrize("change", [("fl_x", 4.0), ("event_camera", "T_frame_event", SHIFT)])
+def test_frames_of_another_camera_give_no_poses(change: tuple, tmp_path: Path) -> None:
+    *place, value = change
     data = write_native(tmp_path / "made")
-    set_in("transforms.json", "fl_x", value=4.0)(data)
+    set_in("transforms.json", *place, value=value)(data)
+    assert not convert(data, tmp_path / "given").has_own_frames
     with pytest.raises(DataError, match="frames are of another camera than its events"):
         convert(data, tmp_path / "converted", poses="colmap")
 

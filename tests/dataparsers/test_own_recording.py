@@ -251,6 +251,16 @@ def test_refuse_a_colmap_model_that_does_not_fit_the_images(placed: Truth) -> No
         opened(placed)
 
 
+def test_a_mount_tells_two_cameras_of_one_kind_apart(truth: Truth) -> None:
+    camera = CALIBRATION["event_camera"]
+    for mount, is_own in ((np.eye(4), True), (make_poses(3)[1], False)):
+        calibration = {"event_camera": {**camera, "T_frame_event": mount.tolist()}}
+        (truth.data / "calibration.json").write_text(json.dumps(calibration))
+        recording = opened(truth)
+        assert recording.frame_camera == recording.event_camera
+        assert recording.has_own_frames == is_own
+
+
 def test_frames_of_a_recording_without_poses_are_in_the_order_of_time(truth: Truth) -> None:
     frames = opened(truth).frames
     (truth.data / "trajectory.txt").unlink()
