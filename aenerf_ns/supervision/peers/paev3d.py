@@ -18,7 +18,7 @@ Mercerai/PAEv3d, read at 97f6a2b. The release has no license, so nothing of it w
 - **Units.** All losses are divided by the mean contrast threshold, so their weights mean the same as in the release.
 - **Two thresholds.** Positive and negative events count with the sensor's C+ and C-, and the change is cut at five of
   either.
-- **Windows** of the release are up to 10 pose intervals long. Here they are up to 0.01 of the recording's.
+- **Windows** of the release are up to 10 pose intervals long. Here they are up to 0.1 of the recording's.
 """
 
 from __future__ import annotations
