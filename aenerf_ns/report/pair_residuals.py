@@ -31,7 +31,7 @@ class PairResiduals:
         num_pairs: pairs that were compared.
         edges: of the histogram's bins, alike along both axes.
         histogram: number of pairs by bin of the rendered change, then of the measured change.
-        correlation: of rendered and measured changes.
+        correlation: of rendered and measured changes, None where all of either are the same.
         mean_residual: mean absolute difference.
         by_length: ``mean_residual`` and ``num_pairs`` of classes of pairs by their number of ``events``,
             with those that a blind pixel missed.
@@ -41,7 +41,7 @@ class PairResiduals:
     num_pairs: int
     edges: list[float]
     histogram: list[list[int]]
-    correlation: float
+    correlation: float | None
     mean_residual: float
     by_length: list[dict[str, Any]]
     by_tile: list[list[float | None]]
@@ -79,12 +79,13 @@ def measure_pair_residuals(run: TrainedRun) -> PairResiduals | None:
     rendered, measured = rendered[at_events], measured[at_events]
     residual = np.abs(rendered - measured)
     edges, histogram = _histogram(measured, rendered)
+    varies = min(np.ptp(measured), np.ptp(rendered)) > 0
     camera = run.scene.event_camera
     return PairResiduals(
         num_pairs=len(residual),
         edges=edges,
         histogram=histogram,
-        correlation=float(np.corrcoef(measured, rendered)[0, 1]),
+        correlation=float(np.corrcoef(measured, rendered)[0, 1]) if varies else None,
         mean_residual=float(residual.mean()),
         by_length=average_by_length(length, residual),
         by_tile=average_by_tile(pixel, residual, camera.width, camera.height),

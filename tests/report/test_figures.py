@@ -22,7 +22,7 @@ from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.recording.writer import NativeDatasetWriter
 from aenerf_ns.report.comparison import Protocol, paired_differences, protocol_differences, shared_views, views_left_out
 from aenerf_ns.report.measuring import RunReport
-from aenerf_ns.report.pair_residuals import average_by_length, average_by_tile
+from aenerf_ns.report.pair_residuals import average_by_length, average_by_tile, measure_pair_residuals
 from aenerf_ns.report.poses import RunPoses, correction_components, measure_poses
 from aenerf_ns.report.run_files import TrainingRecord, read_record, read_scalars
 from aenerf_ns.report.view_pictures import choose_views
@@ -73,6 +73,14 @@ def test_average_residuals_by_length_and_tile() -> None:
     assert tiles[5][11] == 1.0
     assert tiles[0][1] == 3.0
     assert sum(value is not None for row in tiles for value in row) == 2
+
+
+def test_pairs_that_are_all_alike_have_no_correlation(tmp_path: Path) -> None:
+    pipeline = make_pipeline(tmp_path / "data", "test").eval()
+    residuals = measure_pair_residuals(pipeline.trained_run())
+    # Of the only pair.
+    assert residuals is not None
+    assert residuals.correlation is None
 
 
 def test_choose_worst_median_and_best_view() -> None:

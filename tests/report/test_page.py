@@ -125,6 +125,11 @@ def test_page_of_a_run_without_measurements() -> None:
         assert text in page, text
 
 
+def test_page_of_pairs_that_are_all_alike() -> None:
+    pairs = PairResiduals(1, [-1.0, 1.0], [[1]], None, 0.75, [], [[None]])
+    assert "a: 1 pairs, mean residual 0.750 thresholds" in page_of([make_report("a", pairs=pairs)], [])
+
+
 def test_page_compares_runs_on_shared_views() -> None:
     first, second = make_report("a"), make_report("b")
     shared = list(first.chosen)
