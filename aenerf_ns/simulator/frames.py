@@ -67,7 +67,7 @@ def frame_parameters(
     shrink = _PROBE_WIDTH / width
     rows = int(np.ceil(height * shrink))
     probe = tuple(shrink * np.asarray(intrinsics, np.float64))
-    target = _MARGIN * max_displacement
+    target, sees_infinity = _MARGIN * max_displacement, scene.renderer.background is None
     # A probe is too small to share among threads: synchronizing them takes longer than rendering.
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
@@ -78,7 +78,7 @@ def frame_parameters(
             while True:
                 step = min(step, _MAX_STEP, 1.0 - parameters[-1])
                 next_pose = scene.path(parameters[-1] + step)
-                displacement = frame_displacement(depth, pose, next_pose, probe, scene.background is None) / shrink
+                displacement = frame_displacement(depth, pose, next_pose, probe, sees_infinity) / shrink
                 if displacement <= max_displacement:
                     break
                 step *= max(target / displacement, 0.1)

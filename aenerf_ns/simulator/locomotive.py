@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import replace
 
@@ -10,10 +11,11 @@ import numpy as np
 from aenerf_ns.simulator import textures as tx
 from aenerf_ns.simulator.arrays import Texture
 from aenerf_ns.simulator.rendering.environment import sky
-from aenerf_ns.simulator.rendering.lighting import AreaLight
+from aenerf_ns.simulator.rendering.lighting import AreaLight, light_mesh
 from aenerf_ns.simulator.rendering.mesh import Gloss
+from aenerf_ns.simulator.rendering.mesh_repair import repair
 from aenerf_ns.simulator.rendering.renderer import Renderer
-from aenerf_ns.simulator.shapes import ALONG_X, ALONG_Y, Shape, box, light_shapes, pillar, rod, rotated_box, sphere
+from aenerf_ns.simulator.shapes import ALONG_X, ALONG_Y, Shape, box, mesh_of, pillar, rod, rotated_box, sphere
 
 TEXTURE_SIZE = 256
 BACKGROUND = np.array([0.5, 0.5, 0.5])
@@ -37,11 +39,8 @@ def locomotive_scene(seed: int, *, shiny: bool) -> Renderer:
     shapes = [*_track(), *_wheels(), *_frame(), *_boiler(), *_cab(), *_tender()]
     lamp = AreaLight((2.0, -2.4, 3.6), (-0.42, 0.5, 0.75), (0.85, 0.7, 0.0), (8.4, 7.9, 7.1))
     above = sky((0.3, 0.28, 0.26), (0.62, 0.66, 0.74))
-    gloss = _COATS if shiny else {}
-    scene = light_shapes(
-        shapes, _textures(rng), above, [lamp], BACKGROUND, spacing=0.03, ambient=0.08, seed=seed, gloss=gloss
-    )
-    return replace(scene, limit=1.0)
+    mesh, _ = repair(mesh_of(shapes, _textures(rng), spacing=0.03, gloss=_COATS if shiny else {}), math.inf)
+    return replace(light_mesh(mesh, above, [lamp], BACKGROUND, ambient=0.08, seed=seed), limit=1.0)
 
 
 def _textures(rng: np.random.Generator) -> dict[str, Texture]:

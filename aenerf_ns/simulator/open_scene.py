@@ -15,10 +15,9 @@ from aenerf_ns.files.json_file import read_json
 from aenerf_ns.files.limits import file_inside
 from aenerf_ns.simulator.arrays import Array
 from aenerf_ns.simulator.blender import BlenderRenderer
-from aenerf_ns.simulator.locomotive import BACKGROUND, locomotive_scene
+from aenerf_ns.simulator.locomotive import locomotive_scene
 from aenerf_ns.simulator.options import BLENDER_SUFFIX, BUILT_IN, DURATIONS, require_scene_file
 from aenerf_ns.simulator.paths import CameraPath, ObjectPath, Obstacles, RoomPath, TrackPath, WalkPath
-from aenerf_ns.simulator.rendering.embree import RayCaster
 from aenerf_ns.simulator.rendering.environment import load_environment, sky
 from aenerf_ns.simulator.rendering.lighting import AreaLight, baked_mesh, light_mesh
 from aenerf_ns.simulator.rendering.mesh import Gloss, scaled
@@ -128,9 +127,9 @@ def open_scene(name: str, seed: int = 0) -> SimulationScene:
     if name not in BUILT_IN:
         return _load_scene(Path(name), seed)
     if name == "room":
-        return SimulationScene(room_scene(seed), RoomPath(), focal_ratio=0.62, aabb=None, background=None)
+        return SimulationScene(room_scene(seed), RoomPath(), focal_ratio=0.62, aabb=None)
     renderer, box = locomotive_scene(seed, shiny=name == "shiny_object"), np.array([[-1.2] * 3, [1.2] * 3])
-    return SimulationScene(renderer, ObjectPath(), focal_ratio=1.2, aabb=box, background=BACKGROUND)
+    return SimulationScene(renderer, ObjectPath(), focal_ratio=1.2, aabb=box)
 
 
 def _load_scene(path: Path, seed: int) -> SimulationScene:
@@ -176,20 +175,17 @@ def _load_scene(path: Path, seed: int) -> SimulationScene:
             f"{file}: {num_coincident} faces coincide with others; where they do, the first in the file is seen"
         )
 
-    caster = RayCaster(mesh.vertices, mesh.faces)
-    camera_path = _make_path(path, route, bounds, caster)
-    behind = np.zeros(3) if background is None else background
+    camera_path = _make_path(path, route, bounds, mesh.caster)
     if environment is None or values.light == "baked":
-        renderer = baked_mesh(mesh, caster, behind)
+        renderer = baked_mesh(mesh, background)
     else:
         lamps = [AreaLight(*astuple(lamp)) for lamp in values.light.lamps]
-        renderer = light_mesh(mesh, caster, environment, lamps, behind, show_environment=background is None, seed=seed)
+        renderer = light_mesh(mesh, environment, lamps, background, seed=seed)
     scene = SimulationScene(
         renderer,
         camera_path,
         focal_ratio=values.focal_ratio or _focal_ratio(route),
         aabb=_scene_box(values, route, bounds, background),
-        background=background,
         duration=route.duration,
         notes=tuple(notes),
     )
@@ -220,7 +216,6 @@ def _load_blend(path: Path, file: Path, values: _SceneFile, seed: int) -> Simula
         camera_path,
         focal_ratio,
         aabb=_scene_box(values, route, renderer.bounds, renderer.background),
-        background=renderer.background,
         duration=duration,
         notes=notes,
     )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 
 import numpy as np
@@ -10,9 +11,10 @@ from numpy.typing import ArrayLike
 from aenerf_ns.simulator import textures as tx
 from aenerf_ns.simulator.arrays import Texture
 from aenerf_ns.simulator.rendering.environment import sky
-from aenerf_ns.simulator.rendering.lighting import AreaLight
+from aenerf_ns.simulator.rendering.lighting import AreaLight, light_mesh
+from aenerf_ns.simulator.rendering.mesh_repair import repair
 from aenerf_ns.simulator.rendering.renderer import Renderer
-from aenerf_ns.simulator.shapes import ALONG_X, Shape, axes, box, light_shapes, panel, pillar, rod, rotated_box, sphere
+from aenerf_ns.simulator.shapes import ALONG_X, Shape, axes, box, mesh_of, panel, pillar, rod, rotated_box, sphere
 
 TEXTURE_SIZE = 256
 HALF_SIZE = 2.0
@@ -32,7 +34,8 @@ def room_scene(seed: int) -> Renderer:
         AreaLight((1.72, 0.95, 0.99), (0.1, 0, 0), (0, -0.1, 0), (1.2, 0.9, 0.6)),
     ]
     darkness = sky((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
-    return light_shapes(shapes, _textures(rng), darkness, lights, np.zeros(3), spacing=0.08, ambient=0.09, seed=seed)
+    mesh, _ = repair(mesh_of(shapes, _textures(rng), spacing=0.08), math.inf)
+    return light_mesh(mesh, darkness, lights, background=None, ambient=0.09, seed=seed)
 
 
 def _textures(rng: np.random.Generator) -> dict[str, Texture]:

@@ -18,7 +18,6 @@ class SimulationScene:
         renderer, path: what is seen, and the camera's path with the held-out views around it.
         focal_ratio: focal length divided by image width. Pixels are square, and the principal point is the middle.
         aabb: (2, 3) corners of the box around the scene, or None if the scene surrounds the camera.
-        background: (3,) linear RGB behind the scene, or None if every ray hits something or sees an environment.
         duration: seconds that the path takes at constant speed.
         notes: assumptions that the user should know, a line each.
     """
@@ -27,7 +26,6 @@ class SimulationScene:
     path: CameraPath
     focal_ratio: float
     aabb: Array | None
-    background: Array | None
     duration: float = 4.0
     notes: tuple[str, ...] = ()
 

@@ -11,12 +11,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from aenerf_ns.simulator.arrays import Array, Panorama, Texture
-from aenerf_ns.simulator.rendering.embree import RayCaster
-from aenerf_ns.simulator.rendering.lighting import AreaLight, light_mesh
+from aenerf_ns.simulator.arrays import Array, Texture
 from aenerf_ns.simulator.rendering.mesh import DIFFUSE, Gloss, Mesh, scaled
-from aenerf_ns.simulator.rendering.mesh_repair import repair
-from aenerf_ns.simulator.rendering.renderer import Renderer
 
 _MAX_SAGITTA = 5e-4
 """Largest distance of a triangle from the round surface that it approximates, in meters."""
@@ -81,24 +77,6 @@ def mesh_of(
         tuple(textures.values()),
     )
     return scaled(mesh, 1.0)
-
-
-def light_shapes(
-    shapes: Sequence[Shape],
-    textures: Mapping[str, Texture],
-    environment: Panorama,
-    lamps: Sequence[AreaLight],
-    background: Array,
-    *,
-    spacing: float,
-    ambient: float,
-    seed: int,
-    gloss: Mapping[str, Gloss] = _NO_GLOSS,
-) -> Renderer:
-    """Join shapes, see `mesh_of`, and light them, see `light_mesh`. Light is computed at points ``spacing`` m apart."""
-    mesh, _ = repair(mesh_of(shapes, textures, spacing, gloss), math.inf)
-    caster = RayCaster(mesh.vertices, mesh.faces)
-    return light_mesh(mesh, caster, environment, lamps, background, ambient=ambient, seed=seed)
 
 
 def axes(right: ArrayLike, up: ArrayLike) -> Array:

@@ -12,7 +12,7 @@ import pytest
 import tyro
 
 from aenerf_ns.cli.simulate import Simulate
-from aenerf_ns.simulator import shapes, simulation
+from aenerf_ns.simulator import locomotive, room, shapes, simulation
 
 CPU = ("--machine.device-type", "cpu")
 TIMEOUT = 1200
@@ -39,9 +39,9 @@ def simulate(folder: Path, *options: str) -> Path:
     It has few frames, seen by few rays, in light that is computed at few points.
     """
     size = ("--width", "48", "--height", "36", "--train-images", "4", "--validation-views", "4", "--test-views", "3")
-    mesh_of = shapes.mesh_of
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(shapes, "mesh_of", lambda a, b, spacing, gloss: mesh_of(a, b, 4 * spacing, gloss))
+        for scene in (room, locomotive):
+            patch.setattr(scene, "mesh_of", lambda *args, spacing, **gloss: shapes.mesh_of(*args, 4 * spacing, **gloss))
         patch.setattr(simulation, "RAYS_PER_PIXEL", 4)
         tyro.cli(Simulate, args=["--output", str(folder), "--max-displacement", "2", *size, *options]).main()
     return folder

@@ -9,11 +9,8 @@ import numpy as np
 import trimesh
 from PIL import Image
 
-from aenerf_ns.simulator.rendering import lighting
-from aenerf_ns.simulator.rendering.embree import RayCaster
 from aenerf_ns.simulator.rendering.environment import sky
 from aenerf_ns.simulator.rendering.mesh import Mesh, scaled
-from aenerf_ns.simulator.rendering.renderer import Renderer
 
 OVERHEAD = np.array([[1.0, 0, 0, 0], [0, -1, 0, 0], [0, 0, -1, 3], [0, 0, 0, 1]])
 """A camera 3 m above the origin that looks down, its x axis along the world's."""
@@ -24,14 +21,6 @@ WALK = {
     "positions": [[1.5, 0, 0.3], [0, 1.4, 0.5], [-1.6, 0, 0.2], [0, -1.3, 0.4]],
     "targets": [[0, 0, 0], [0.1, 0, 0], [0, 0, 0.1], [0, 0.1, 0]],
 }
-
-
-def baked_mesh(mesh: Mesh, background: np.ndarray) -> Renderer:
-    return lighting.baked_mesh(mesh, RayCaster(mesh.vertices, mesh.faces), background)
-
-
-def light_mesh(mesh: Mesh, *rest: object, **options: float) -> Renderer:
-    return lighting.light_mesh(mesh, RayCaster(mesh.vertices, mesh.faces), *rest, **options)
 
 
 def mesh_of(shape: trimesh.Trimesh, color: object = (0.5, 0.5, 0.5)) -> Mesh:

@@ -76,7 +76,7 @@ def test_object_stays_in_its_box(toy: SimulationScene) -> None:
         points = (ray_directions(intrinsics, width, height)[hit] * depth[hit][:, None]) @ pose[:3, :3].T + pose[:3, 3]
         assert (points > toy.aabb[0]).all()
         assert (points < toy.aabb[1]).all()
-        np.testing.assert_allclose(radiance[~hit], np.broadcast_to(toy.background, (int((~hit).sum()), 3)))
+        np.testing.assert_allclose(radiance[~hit], np.broadcast_to(toy.renderer.background, (int((~hit).sum()), 3)))
         assert radiance.max() < 1.05
 
 

@@ -9,11 +9,11 @@ import cv2
 import numpy as np
 import pytest
 import trimesh
-from helpers.small_meshes import BLACK, NIGHT, OVERHEAD, joined, light_mesh, mesh_of, plate, ray_directions
+from helpers.small_meshes import BLACK, NIGHT, OVERHEAD, joined, mesh_of, plate, ray_directions
 
 from aenerf_ns.errors import DataError
 from aenerf_ns.simulator.rendering.environment import load_environment, sky, split
-from aenerf_ns.simulator.rendering.lighting import AreaLight, light_points
+from aenerf_ns.simulator.rendering.lighting import AreaLight, light_mesh, light_points
 from aenerf_ns.simulator.rendering.mesh import normals_and_areas
 from aenerf_ns.simulator.rendering.mesh_repair import repair
 

@@ -7,13 +7,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
-from helpers.small_meshes import BLACK, OVERHEAD, baked_mesh, painted_box
+from helpers.small_meshes import BLACK, OVERHEAD, painted_box
 from PIL import Image
 
 from aenerf_ns.camera.image_encoding import decode
 from aenerf_ns.errors import DataError
 from aenerf_ns.simulator import paths
 from aenerf_ns.simulator.open_scene import open_scene
+from aenerf_ns.simulator.rendering.lighting import baked_mesh
 from aenerf_ns.simulator.rendering.mesh import normals_and_areas, scaled
 from aenerf_ns.simulator.rendering.mesh_loading import load_mesh
 

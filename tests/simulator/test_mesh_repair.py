@@ -7,9 +7,10 @@ import dataclasses
 import numpy as np
 import pytest
 import trimesh
-from helpers.small_meshes import BLACK, baked_mesh, joined, mesh_of, plate
+from helpers.small_meshes import BLACK, joined, mesh_of, plate
 
 from aenerf_ns.simulator import paths
+from aenerf_ns.simulator.rendering.lighting import baked_mesh
 from aenerf_ns.simulator.rendering.mesh import normals_and_areas
 from aenerf_ns.simulator.rendering.mesh_loading import triangulate
 from aenerf_ns.simulator.rendering.mesh_repair import repair, subdivided

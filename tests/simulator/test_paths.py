@@ -8,7 +8,6 @@ from helpers.small_meshes import WALK, plate
 from scipy.integrate import quad
 
 from aenerf_ns.simulator import paths
-from aenerf_ns.simulator.rendering.embree import RayCaster
 
 
 def test_look_at() -> None:
@@ -96,7 +95,7 @@ def test_a_track_passes_its_poses_and_has_views_beside_it() -> None:
 
 
 def test_free_space() -> None:
-    space = paths.FreeSpace(RayCaster(plate(1.0).vertices, plate(1.0).faces), 0.1 / 0.13)
+    space = paths.FreeSpace(plate(1.0).caster, 0.1 / 0.13)
     assert space.is_free((0, 0, 0.11))
     assert not space.is_free((0, 0, -0.09))
     assert space.is_reached((0, 0, 0.5), (0.5, 0, 0.5))

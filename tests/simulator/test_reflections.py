@@ -8,11 +8,11 @@ import math
 import numpy as np
 import pytest
 import trimesh
-from helpers.small_meshes import BLACK, NIGHT, OVERHEAD, baked_mesh, joined, light_mesh, mesh_of, plate, ray_directions
+from helpers.small_meshes import BLACK, NIGHT, OVERHEAD, joined, mesh_of, plate, ray_directions
 
 from aenerf_ns.simulator import paths
 from aenerf_ns.simulator.rendering.environment import sky
-from aenerf_ns.simulator.rendering.lighting import AreaLight
+from aenerf_ns.simulator.rendering.lighting import AreaLight, baked_mesh, light_mesh
 from aenerf_ns.simulator.rendering.mesh import Mesh
 from aenerf_ns.simulator.rendering.mesh_repair import repair
 from aenerf_ns.simulator.rendering.renderer import Renderer

@@ -10,14 +10,14 @@ import numpy as np
 import pytest
 import torch
 import trimesh
-from helpers.small_meshes import BLACK, OVERHEAD, baked_mesh, light_mesh, mesh_of, plate, ray_directions
+from helpers.small_meshes import BLACK, OVERHEAD, mesh_of, plate, ray_directions
 from scipy.stats import norm
 
 from aenerf_ns.errors import DataError
 from aenerf_ns.simulator import paths
 from aenerf_ns.simulator.rendering.embree import RayCaster
 from aenerf_ns.simulator.rendering.environment import sky
-from aenerf_ns.simulator.rendering.lighting import AreaLight
+from aenerf_ns.simulator.rendering.lighting import AreaLight, baked_mesh, light_mesh
 from aenerf_ns.simulator.rendering.mesh_repair import repair
 from aenerf_ns.simulator.rendering.mip_maps import mip_maps
 from aenerf_ns.simulator.rendering.renderer import sample_offsets
@@ -81,7 +81,7 @@ def test_surroundings() -> None:
     rows, columns = 90, 180
     down, across = np.meshgrid((np.arange(rows) + 0.5) / rows, (np.arange(columns) + 0.5) / columns, indexing="ij")
     picture = np.stack([down, 0.5 - 0.4 * np.cos(2 * np.pi * across), 0.5 - 0.4 * np.sin(2 * np.pi * across)], axis=-1)
-    scene = light_mesh(plate(0.01), picture.astype(np.float32), [], BLACK, show_environment=True)
+    scene = light_mesh(plate(0.01), picture.astype(np.float32), [], None)
     for azimuth in (0.0, 0.5 * np.pi, -2.0):
         pose = paths.look_at((5, 5, 5), (5 + np.cos(azimuth), 5 + np.sin(azimuth), 5.5))
         radiance, depth = scene.render(pose, (20.0, 20.0, 4.0, 3.0), 8, 6, 1)

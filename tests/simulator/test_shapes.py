@@ -9,9 +9,10 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 import trimesh
-from helpers.small_meshes import BLACK, OVERHEAD, baked_mesh
+from helpers.small_meshes import BLACK, OVERHEAD
 
 from aenerf_ns.simulator import shapes
+from aenerf_ns.simulator.rendering.lighting import baked_mesh
 from aenerf_ns.simulator.rendering.mesh import normals_and_areas
 from aenerf_ns.simulator.rendering.mesh_repair import without_degenerate_faces
 

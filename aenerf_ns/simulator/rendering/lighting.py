@@ -24,7 +24,7 @@ from aenerf_ns.simulator.rendering.environment import row_weights, split
 from aenerf_ns.simulator.rendering.mesh import Mesh, normals_and_areas, position_ids
 from aenerf_ns.simulator.rendering.mip_maps import lookup, mip_maps, panorama
 from aenerf_ns.simulator.rendering.reflections import hit_weights, make_reflections
-from aenerf_ns.simulator.rendering.renderer import Renderer, make_surroundings
+from aenerf_ns.simulator.rendering.renderer import Renderer
 from aenerf_ns.simulator.rendering.surface import Surface, face_normal, make_surface
 from aenerf_ns.simulator.rendering.vectors import dot, length, row
 from aenerf_ns.threads import run_ranges
@@ -129,12 +129,10 @@ def _smooth_parts(start, order, normals, part):
 
 def light_mesh(
     mesh: Mesh,
-    caster: RayCaster,
     environment: Panorama,
     lamps: Sequence[AreaLight],
-    background: Array,
+    background: Array | None,
     *,
-    show_environment: bool = False,
     ambient: float = 0.0,
     seed: int = 0,
 ) -> Renderer:
@@ -143,10 +141,9 @@ def light_mesh(
     Light that a glossy face passes on to other faces is computed as if the face were diffuse.
 
     Args:
-        mesh, caster: the mesh, and what casts rays against it.
+        mesh: the mesh.
         environment, lamps: the light.
-        background: (3,) radiance where a camera's ray hits nothing, unless the environment is shown there.
-        show_environment: whether the camera sees the environment where its ray hits nothing.
+        background: (3,) radiance where a camera's ray hits nothing, or None where the environment is seen there.
         ambient: radiance that reaches every surface from all sides, occluded or not. It keeps crevices from going
             black, where small differences would become large contrasts of log-radiance.
         seed: of the sampling.
@@ -154,21 +151,22 @@ def light_mesh(
     points = light_points(mesh)
     surface = make_surface(mesh, points.corner)
     emitters = np.array(lamps, np.float64).reshape(-1, 4, 3)
-    light = compute_light(surface, caster, points, environment, emitters, ambient, seed)
+    light = compute_light(surface, mesh.caster, points, environment, emitters, ambient, seed)
     glow = np.zeros(len(points.position), np.float32)
     np.maximum.at(glow, points.corner, mesh.emission[:, None].astype(np.float32))
     light += glow[:, None]
     gloss = None
     if mesh.gloss[:, 0].any():
-        gloss = make_reflections(mesh, points.corner, points.normal, emitters, make_surroundings(environment), ambient)
-    shown = make_surroundings(environment if show_environment else None)
-    return Renderer(surface, caster, light, background, shown, reflections=gloss)
+        far = mip_maps([environment], bits16=False)
+        gloss = make_reflections(mesh, points.corner, points.normal, emitters, far, ambient)
+    seen = mip_maps([environment] if background is None else [], bits16=False)
+    return Renderer(surface, mesh.caster, light, background, seen, reflections=gloss)
 
 
-def baked_mesh(mesh: Mesh, caster: RayCaster, background: Array) -> Renderer:
+def baked_mesh(mesh: Mesh, background: Array | None) -> Renderer:
     """Return a renderer of a mesh whose colors are radiance, in front of a uniform background (3,)."""
     surface, light = make_surface(mesh, np.zeros_like(mesh.faces)), np.ones((2, 1, 3), np.float32)
-    return Renderer(surface, caster, light, background, make_surroundings(None))
+    return Renderer(surface, mesh.caster, light, background, mip_maps([], bits16=False))
 
 
 def compute_light(

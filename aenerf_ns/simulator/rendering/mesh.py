@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from aenerf_ns.simulator.arrays import Array, Texture
+from aenerf_ns.simulator.rendering.embree import RayCaster
 
 
 class Gloss(NamedTuple):
@@ -49,6 +51,11 @@ class Mesh:
     emission: Array
     gloss: Array
     textures: tuple[Texture, ...]
+
+    @cached_property
+    def caster(self) -> RayCaster:
+        """Casts rays against the mesh."""
+        return RayCaster(self.vertices, self.faces)
 
     def with_faces_kept(self, kept: NDArray) -> Mesh:
         """Return the mesh with the faces that an index or a mask (F,) selects."""

@@ -8,7 +8,6 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from aenerf_ns.simulator.rendering.embree import RayCaster
 from aenerf_ns.simulator.rendering.mesh import Mesh, normals_and_areas, position_ids
 
 _RESOLUTION = 4e-6
@@ -98,7 +97,6 @@ def with_coincident_faces_apart(mesh: Mesh, order: NDArray[np.int64]) -> tuple[M
     resolution = _RESOLUTION * float(np.abs(mesh.vertices).max())
     a, b, c = mesh.vertices[mesh.faces.T]
     normal = normals_and_areas(mesh)[0]
-    caster = RayCaster(mesh.vertices, mesh.faces)
     above = 16 * resolution
     is_moved = np.zeros(len(mesh.faces), bool)
     shift = np.zeros((len(mesh.faces), 3))
@@ -108,7 +106,7 @@ def with_coincident_faces_apart(mesh: Mesh, order: NDArray[np.int64]) -> tuple[M
         # The rays end just behind the face. Hits beyond that are listed too, and ignored.
         rays = np.concatenate([points + above * normal, -above * normal], axis=1).astype(np.float32)
         for start in range(0, len(rays), 1 << 18):
-            face, other, distance = caster.all_hits(rays[start : start + (1 << 18)])
+            face, other, distance = mesh.caster.all_hits(rays[start : start + (1 << 18)])
             face = face + start
             near = (np.abs(distance - 1) * above < resolution) & (face != other)
             near &= np.abs((normal[face] * normal[other]).sum(axis=1)) > 0.999

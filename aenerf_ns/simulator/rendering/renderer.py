@@ -17,9 +17,9 @@ import numba
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from aenerf_ns.simulator.arrays import Array, Panorama
+from aenerf_ns.simulator.arrays import Array
 from aenerf_ns.simulator.rendering.embree import NOTHING, RayCaster
-from aenerf_ns.simulator.rendering.mip_maps import MipMaps, mip_maps, panorama
+from aenerf_ns.simulator.rendering.mip_maps import MipMaps, panorama
 from aenerf_ns.simulator.rendering.reflections import Reflections, add_reflections, hit_weights
 from aenerf_ns.simulator.rendering.surface import FOOTPRINT, Surface, diffuse_radiance, face_normal
 from aenerf_ns.simulator.rendering.vectors import dot, length
@@ -76,8 +76,8 @@ class Renderer:
     Attributes:
         surface, caster: the mesh.
         light: (2, G, 3) irradiance / pi at the light points, in front of the faces and behind them.
-        background: (3,) radiance where a ray hits nothing and ``surroundings`` is empty.
-        surroundings: panorama that is seen where a ray hits nothing, or empty.
+        background: (3,) radiance where a ray hits nothing, or None where it sees the surroundings.
+        surroundings: panorama that is seen without a background, else empty.
         limit: the radiance of the surroundings and of glossy surfaces is clipped to this value.
         reflections: reflections of glossy surfaces, or None if all surfaces are diffuse.
         gain: factor of all light but the background's.
@@ -86,7 +86,7 @@ class Renderer:
     surface: Surface
     caster: RayCaster
     light: NDArray[np.float32]
-    background: Array
+    background: Array | None
     surroundings: MipMaps
     limit: float = math.inf
     reflections: Reflections | None = None
@@ -119,16 +119,12 @@ class Renderer:
         hits = self.caster.cast(rays)
         radiance, depth = np.empty((height, width, 3), np.float32), np.empty((height, width), np.float32)
         limit = self.limit / self.gain
-        scene = self.background / self.gain, self.surroundings, limit
+        background = np.zeros(3) if self.background is None else self.background / self.gain
+        scene = background, self.surroundings, limit
         run_ranges(partial(_shade, self.surface, self.light, rays, hits, fx, *scene, radiance, depth), height)
         if self.reflections is not None:
             add_reflections(self.reflections, self.surface, self.light, self.caster, rays, hits, fx, limit, radiance)
         return np.float32(self.gain) * radiance, depth
-
-
-def make_surroundings(environment: Panorama | None) -> MipMaps:
-    """Build the panorama behind a mesh, empty where there is no environment to be seen."""
-    return mip_maps([] if environment is None else [environment], bits16=False)
 
 
 def sample_offsets(samples: int) -> NDArray[np.float64]:
