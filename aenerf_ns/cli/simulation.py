@@ -99,7 +99,8 @@ class SimulationCommand:
     def make_sensor(self) -> tuple[SensorModel, SensorNoise]:
         """Make the sensor and its noise."""
         sensor, noise = SENSORS[self.sensor]
-        return replace(sensor, **sensor_values(self)), self.noise.with_defaults(noise)
+        given = {name: value for name, value in vars(self.noise).items() if value is not None}
+        return replace(sensor, **sensor_values(self)), replace(noise, **given)
 
     def add_pose_noise(self, poses: Trajectory) -> Trajectory:
         """Add errors to true poses."""

@@ -54,10 +54,6 @@ class SensorNoise:
     time_resolution_ns: int | None = None
     """Nanoseconds from one tick of the sensor's clock to the next. Times are rounded down to a tick."""
 
-    def with_defaults(self, defaults: SensorNoise) -> SensorNoise:
-        """Return the values that are not None, and otherwise those of ``defaults``."""
-        return replace(defaults, **{name: value for name, value in vars(self).items() if value is not None})
-
 
 _DAVIS346 = SensorNoise(
     contrast_threshold_spread=0.03,
