@@ -13,7 +13,7 @@ import json
 import re
 from decimal import Decimal
 from pathlib import Path
-from typing import Any, NoReturn, TypeVar
+from typing import Any, TypeVar
 
 import msgspec
 
@@ -49,7 +49,7 @@ def read_json(path: Path, kind: type[T], remedy: str = DATASET_REMEDY) -> T:
             text,
             parse_float=_parse_decimal,
             parse_int=_parse_integer,
-            parse_constant=_refuse_constant,
+            parse_constant=_parse_decimal,
             object_pairs_hook=_make_object,
         )
     except (ValueError, RecursionError) as error:
@@ -102,8 +102,8 @@ def _parse_decimal(text: str) -> Decimal:
         value = Decimal(text)
     except ArithmeticError:
         value = None
-    if value is None or value.adjusted() > _MAX_EXPONENT:
-        raise ValueError(f"the number {text[:40]} is too large")
+    if value is None or not value.is_finite() or value.adjusted() > _MAX_EXPONENT:
+        raise ValueError(f"the number {text[:40]} is not finite, or too large")
     return value
 
 
@@ -121,7 +121,3 @@ def _make_object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
         names = [name for name, _ in pairs]
         raise ValueError(f"duplicate key {max(names, key=names.count)[:40]!r}")
     return values
-
-
-def _refuse_constant(text: str) -> NoReturn:
-    raise ValueError(f"{text} is not allowed in JSON")
