@@ -226,7 +226,12 @@ class Hdf5EventWriter:
         self._last_time: int | None = None
         try:
             self._reserve(0)
-            self._columns = self._create_columns()
+            group = self._file.create_group("events")
+            group.attrs["time_unit"] = "ns"
+            group.attrs["time_offset"] = 0
+            layout: dict[str, Any] = {"shape": (0,), "maxshape": (None,), "chunks": (1 << 16,), "shuffle": True}
+            layout |= {"compression": "gzip", "compression_opts": 1}
+            self._columns = {name: group.create_dataset(name, dtype=dtype, **layout) for name, dtype in _DTYPES.items()}
         except OSError:
             self._file.close()
             raise
@@ -244,14 +249,6 @@ class Hdf5EventWriter:
         if end > self._reserved:
             os.posix_fallocate(self._file.id.get_vfd_handle(), self._reserved, end - self._reserved)
             self._reserved = end
-
-    def _create_columns(self) -> dict[str, h5py.Dataset]:
-        group = self._file.create_group("events")
-        group.attrs["time_unit"] = "ns"
-        group.attrs["time_offset"] = 0
-        layout: dict[str, Any] = {"shape": (0,), "maxshape": (None,), "chunks": (1 << 16,), "shuffle": True}
-        layout |= {"compression": "gzip", "compression_opts": 1}
-        return {name: group.create_dataset(name, dtype=dtype, **layout) for name, dtype in _DTYPES.items()}
 
     def __enter__(self) -> Hdf5EventWriter:
         return self
