@@ -149,7 +149,11 @@ class OwnRecordingDataParser(EventDataParser):
             found = [self._folder / name for name in CALIBRATIONS if (self._folder / name).is_file()]
             if not found:
                 require_no_names(self._folder, config.event_camera, config.frame_camera)
-                return _guess_calibration(self._event_file())
+                # Only the size of the camera is known, which the event file states.
+                events = self._event_file()
+                camera = CameraIntrinsics.guess(events.width, events.height)
+                motion = torch.eye(4, dtype=torch.float64)
+                return Calibration(camera, camera, motion, intrinsics_origin="guessed")
             file = require_one(found, self._folder, f"of {' and '.join(CALIBRATIONS)}", "give one as --calibration")
         return read_calibration(file, config.event_camera, config.frame_camera, has_images)
 
@@ -168,12 +172,6 @@ class OwnRecordingDataParser(EventDataParser):
 def _is_event_file(data: Path) -> bool:
     # It may be gone when a trained run is opened.
     return data.suffix.lower() in SUFFIXES and not data.is_dir()
-
-
-def _guess_calibration(events: EventFile) -> Calibration:
-    """Return a guess for a camera. Only its size is known, which the event file states."""
-    camera = CameraIntrinsics.guess(events.width, events.height)
-    return Calibration(camera, camera, torch.eye(4, dtype=torch.float64), intrinsics_origin="guessed")
 
 
 def _read_colmap(

@@ -112,7 +112,7 @@ class TumVieDataParser(EventDataParser):
         events, sequence, side = _choose(self.data)
         capture, imu_from_event, imu_from_frame = self._read_cameras()
         # The motion capture gives the poses of its marker.
-        path = _find_calibration(events.parent, f"mocap-imu-calibration{_calibration_set(sequence)}.json")
+        path = _find_calibration(events.parent, "mocap-imu-calibration", sequence)
         imu_from_marker = read_json(path, _File[_Mocap]).value0.T_imu_marker.matrix(path)
         marker_from_event = torch.linalg.inv(imu_from_marker) @ imu_from_event
         mocap = self.poses_path()
@@ -135,7 +135,7 @@ class TumVieDataParser(EventDataParser):
     def _read_cameras(self) -> tuple[Capture, Tensor, Tensor]:
         """Read the cameras, and the (4, 4) motions from the event and the frame camera's coordinates to the IMU's."""
         events, sequence, side = _choose(self.data)
-        path = _find_calibration(events.parent, f"camera-calibration{_calibration_set(sequence)}.json")
+        path = _find_calibration(events.parent, "camera-calibration", sequence)
         cameras = read_json(path, _File[_Cameras]).value0
         (event_camera, imu_from_event), (frame_camera, imu_from_frame) = (
             _read_camera(path, cameras, index) for index in _INDICES[side]
@@ -147,10 +147,6 @@ class TumVieDataParser(EventDataParser):
             frame_camera=frame_camera,
         )
         return capture, imu_from_event, imu_from_frame
-
-
-def _calibration_set(sequence: str) -> Literal["A", "B"]:
-    return "A" if sequence.startswith(_SET_A) else "B"
 
 
 def _event_files(data: Path) -> list[Path]:
@@ -172,8 +168,9 @@ def _choose(data: Path) -> tuple[Path, str, str]:
     return file, match["sequence"], match["side"]
 
 
-def _find_calibration(folder: Path, name: str) -> Path:
-    """Return the path of a calibration file, which is beside the sequence or one folder up."""
+def _find_calibration(folder: Path, kind: str, sequence: str) -> Path:
+    """Return the path of a sequence's calibration file, which is beside the sequence or one folder up."""
+    name = f"{kind}{'A' if sequence.startswith(_SET_A) else 'B'}.json"
     for path in (folder / name, folder.parent / name):
         if path.is_file():
             return path
