@@ -7,7 +7,6 @@ import hashlib
 import shutil
 import statistics
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass
 from functools import partial
 from importlib.metadata import version
 from pathlib import Path
@@ -37,38 +36,6 @@ _DATABASE, _INPUTS = "database.db", "inputs.txt"
 _TOLERANCE = 1e-4
 # Pixels that a match may be off.
 _MAX_EPIPOLAR_ERROR = 1.0
-
-
-@dataclass(frozen=True)
-class HeldOutMatches:
-    """Matches between frames that no model was made of.
-
-    Attributes:
-        pairs: the COLMAP indices of two frames, and the (M, 2) rays of the matched features in each, as points in the
-            plane at depth 1.
-        focal_length: in pixels.
-    """
-
-    pairs: list[tuple[tuple[int, int], list[NDArray[np.float64]]]]
-    focal_length: float
-
-    def agreement(self, model: Any) -> float | None:
-        """Return the share of the matches that fit the poses of a model: matches of frames without a pose do not.
-
-        None where there are no matches.
-
-        A match fits if its epipolar error (Sampson's distance) is less than a pixel.
-        """
-        poses = {image.image_id: image.cam_from_world() for image in placed_images(model)}
-        fitting = total = 0
-        for (first, second), rays in self.pairs:
-            total += len(rays[0])
-            if first not in poses or second not in poses:
-                continue
-            essential = pycolmap.essential_matrix_from_pose(poses[second] * poses[first].inverse())
-            errors = np.sqrt(pycolmap.compute_squared_sampson_error(rays[0], rays[1], essential))
-            fitting += int((errors * self.focal_length < _MAX_EPIPOLAR_ERROR).sum())
-        return fitting / total if total else None
 
 
 @contextlib.contextmanager
@@ -118,6 +85,10 @@ class ColmapWorkspace:
         seed: of COLMAP's random samples.
         progress: shows each step.
         min_motion: pixels that a feature must have moved, or its match is left out.
+
+    Attributes:
+        held_out: matches that no model is made of: the COLMAP indices of two frames, and the (M, 2) rays of the matched
+            features in each, as points in the plane at depth 1.
     """
 
     def __init__(self, folder: Path, num_frames: int, seed: int, progress: Progress, min_motion: float = 0.0) -> None:
@@ -132,6 +103,7 @@ class ColmapWorkspace:
         self._seed = seed % 2**31
         self._progress = progress
         self._min_motion = min_motion
+        self.held_out: list[tuple[tuple[int, int], list[NDArray[np.float64]]]] = []
 
     def add_frames(self, frames: Iterable[Path | NDArray[np.uint8]], size: tuple[int, int], source: str | Path) -> None:
         """Write the frames as image files for COLMAP."""
@@ -227,13 +199,13 @@ class ColmapWorkspace:
         options.stationary_matches_max_error = self._min_motion
         return options
 
-    def hold_out_matches(self, share: float) -> HeldOutMatches:
+    def hold_out_matches(self, share: float) -> None:
         """Take the matches of a share of the pairs of frames out of the database, to judge models by."""
         with pycolmap.Database.open(self._database) as database:
             camera = database.read_all_cameras()[0]
+            self._focal_length = camera.mean_focal_length()
             pair_ids, geometries = database.read_two_view_geometries()
             chosen = np.random.default_rng(self._seed).random(len(pair_ids)) < share
-            matches = []
             for pair_id, geometry, is_chosen in zip(pair_ids, geometries, chosen, strict=True):
                 if not is_chosen or len(geometry.inlier_matches) == 0:
                     continue
@@ -242,10 +214,25 @@ class ColmapWorkspace:
                     camera.cam_from_img(np.asarray(database.read_keypoints(image), np.float64)[rows, :2])
                     for image, rows in zip(images, geometry.inlier_matches.T, strict=True)
                 ]
-                matches.append((images, rays))
+                self.held_out.append((images, rays))
                 database.delete_two_view_geometry(*images)
                 database.delete_matches(*images)
-        return HeldOutMatches(matches, camera.mean_focal_length())
+
+    def agreement(self, model: Any) -> float | None:
+        """Return the share of the held-out matches that fit the poses of a model; those of frames without one do not.
+
+        None where there are no matches. A match fits if its epipolar error (Sampson's distance) is less than a pixel.
+        """
+        poses = {image.image_id: image.cam_from_world() for image in placed_images(model)}
+        fitting = total = 0
+        for (first, second), rays in self.held_out:
+            total += len(rays[0])
+            if first not in poses or second not in poses:
+                continue
+            essential = pycolmap.essential_matrix_from_pose(poses[second] * poses[first].inverse())
+            errors = np.sqrt(pycolmap.compute_squared_sampson_error(rays[0], rays[1], essential))
+            fitting += int((errors * self._focal_length < _MAX_EPIPOLAR_ERROR).sum())
+        return fitting / total if total else None
 
     def reconstruct(self, refine_intrinsics: bool = False, start: Any = None) -> list[Any]:
         """Return the models of the incremental mapper, in the order of the number of frames, the largest first.

@@ -60,7 +60,7 @@ def estimate_poses_from_events(
         is_calibrated = capture.intrinsics_origin != "guessed"
         camera = capture.event_camera if is_calibrated else workspace.estimate_intrinsics(_ROUNDS)
         features, pairs = workspace.count_features_and_pairs()
-        held_out = workspace.hold_out_matches(_HELD_OUT)
+        workspace.hold_out_matches(_HELD_OUT)
 
         found: dict[str, list[Any]] = {}
         fits: dict[str, tuple[bool, float]] = {}
@@ -69,7 +69,7 @@ def estimate_poses_from_events(
         for mapper, place in mappers.items() if camera else ():
             found[mapper] = place()
             if found[mapper]:
-                share = held_out.agreement(found[mapper][0]) or 0.0
+                share = workspace.agreement(found[mapper][0]) or 0.0
                 lead = _GLOBAL_LEAD if mapper == "global" else 0.0
                 fits[mapper] = is_sound(found[mapper][0], _ROUNDS[-1][0]), share + lead
                 if fits[mapper] >= (True, _GOOD_FIT):
@@ -102,7 +102,7 @@ def estimate_poses_from_events(
 
         placed = poses_of(model).keys()
         others = [other for other in found[mapper][1:] if not poses_of(other).keys() <= placed]
-        agreement, error = held_out.agreement(model), model.compute_mean_reprojection_error()
+        agreement, error = workspace.agreement(model), model.compute_mean_reprojection_error()
         stand_upright(model)
     return EstimatedPoses(
         frame_times=times,

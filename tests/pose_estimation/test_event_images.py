@@ -54,7 +54,8 @@ def test_what_stands_still_matches_nothing(monkeypatch: pytest.MonkeyPatch) -> N
     capture = SimpleNamespace(event_camera=camera, intrinsics_origin="given")
     with event_images.match_event_images(capture, TimeWindow(), "made", 0, None, None) as (workspace, _, _):
         features, pairs = workspace.count_features_and_pairs()
-        matches = workspace.hold_out_matches(1.1).pairs
+        workspace.hold_out_matches(1.1)
+        matches = workspace.held_out
     assert features > 100
     assert pairs == len(matches) == 3
     for (first, second), (here, there) in matches:
