@@ -75,31 +75,11 @@ def _linear_events(interval, reference_log, reference_time, sensor, pixel, event
 
 
 @numba.njit(cache=True)
-def _pixel_events(interval, reference_log, reference_time, sensor, noise_times, noise_polarities, pixel, events):
-    """Fire the events of one pixel in one frame interval, which noise events cut into pieces.
-
-    A noise event acts like any other: the pixel is blind for the refractory period, or takes the log-intensity of that
-    moment as its reference. For the arguments and the values returned see `_linear_events`.
-    """
-    start_log, end_log, start_time, end_time = interval
-    piece_log, piece_time = start_log, start_time
-    for i in range(len(noise_times) + 1):
-        time = noise_times[i] if i < len(noise_times) else end_time
-        log = start_log + (end_log - start_log) * ((time - start_time) / (end_time - start_time))
-        piece = piece_log, log if time < end_time else end_log, piece_time, time
-        reference_log, reference_time = _linear_events(piece, reference_log, reference_time, sensor, pixel, events)
-        piece_log, piece_time = log, time
-        if i < len(noise_times) and reference_time < time:
-            events.append((time, pixel, noise_polarities[i]))
-            reference_log = log
-            if sensor[2] > 0:
-                reference_time = time + sensor[2]
-    return reference_log, reference_time
-
-
-@numba.njit(cache=True)
 def _frame_events(frames, times, references, thresholds, refractory_period, noise):
     """Fire the events of all pixels in one frame interval.
+
+    Noise events cut the interval of their pixel into pieces. A noise event acts like any other: the pixel is blind for
+    the refractory period, or takes the log-intensity of that moment as its reference.
 
     Args:
         frames, times: log-intensity (H, W) and time at the start and at the end.
@@ -112,24 +92,33 @@ def _frame_events(frames, times, references, thresholds, refractory_period, nois
         (N, 3) times, pixels and polarities, pixel by pixel.
     """
     height, width = frames[0].shape
+    start_time, end_time = times
     noise_pixels, noise_times, noise_polarities = noise
     events = [(np.int64(0), 0, np.int64(0)) for _ in range(0)]
-    last = 0
+    next_noise = 0
     for y in range(height):
         for x in range(width):
-            first, pixel = last, y * width + x
-            while last < len(noise_pixels) and noise_pixels[last] == pixel:
-                last += 1
-            references[0][y, x], references[1][y, x] = _pixel_events(
-                (frames[0][y, x], frames[1][y, x], times[0], times[1]),
-                references[0][y, x],
-                references[1][y, x],
-                (thresholds[0][y, x], thresholds[1][y, x], refractory_period),
-                noise_times[first:last],
-                noise_polarities[first:last],
-                pixel,
-                events,
-            )
+            pixel, sensor = y * width + x, (thresholds[0][y, x], thresholds[1][y, x], refractory_period)
+            start_log, end_log = frames[0][y, x], frames[1][y, x]
+            reference_log, reference_time = references[0][y, x], references[1][y, x]
+            piece_log, piece_time = start_log, start_time
+            is_cut = True
+            while is_cut:
+                is_cut = next_noise < len(noise_pixels) and noise_pixels[next_noise] == pixel
+                time = noise_times[next_noise] if is_cut else end_time
+                log = start_log + (end_log - start_log) * ((time - start_time) / (end_time - start_time))
+                piece = piece_log, log if time < end_time else end_log, piece_time, time
+                reference_log, reference_time = _linear_events(
+                    piece, reference_log, reference_time, sensor, pixel, events
+                )
+                piece_log, piece_time = log, time
+                if is_cut and reference_time < time:
+                    events.append((time, pixel, noise_polarities[next_noise]))
+                    reference_log = log
+                    if refractory_period > 0:
+                        reference_time = time + refractory_period
+                next_noise += is_cut
+            references[0][y, x], references[1][y, x] = reference_log, reference_time
     table = np.empty((len(events), 3), np.int64)
     for i, event in enumerate(events):
         table[i, 0], table[i, 1], table[i, 2] = event
