@@ -52,7 +52,7 @@ class CameraTrack(NamedTuple):
 
 
 class BlenderRenderer:
-    """Render a .blend file as it stands at the first frame of its animation.
+    """Render a .blend file as it stands at the first frame of its animation, and tell how far its surfaces are.
 
     A picture has a fixed pattern of noise, which is denoised: a still camera sees a still picture.
 
@@ -71,7 +71,6 @@ class BlenderRenderer:
     Attributes:
         background: (3,), or None if the world is shown.
         bounds: (2, 3) lowest and highest corner of all surfaces.
-        obstacles: the surfaces, for questions about distances.
         track: the moves of the file's camera, or None if they are not wanted or it does not move.
         notes: what the user should know, a line each.
     """
@@ -113,17 +112,16 @@ class BlenderRenderer:
             collections += collection.children
         for item in bpy.context.view_layer.objects:
             item.hide_set(False)
-        depsgraph = bpy.context.evaluated_depsgraph_get()
+        self._depsgraph = bpy.context.evaluated_depsgraph_get()
         boxes = [
             np.array(each.object.bound_box) @ np.array(each.matrix_world)[:3, :3].T + each.matrix_world.translation
-            for each in depsgraph.object_instances
+            for each in self._depsgraph.object_instances
             if each.object.type in _SURFACES and each.show_self and each.object.visible_camera
         ]
         if not boxes:
             raise DataError(path, "it has no surfaces to render", "give a scene with objects that are rendered")
         corners = np.concatenate(boxes) * self._scale
         self.bounds = np.stack([corners.min(axis=0), corners.max(axis=0)])
-        self.obstacles = _SceneObstacles(scene, depsgraph, self._scale)
         self._folder = TemporaryDirectory()
         with _silence():
             self._set_up(seed)
@@ -262,13 +260,6 @@ class BlenderRenderer:
         pixels = pixels[::-1][margin : margin + height, margin : margin + width]
         depth = np.where(pixels[..., 3] < _NOWHERE, pixels[..., 3] * np.float32(self._scale), np.float32(np.inf))
         return np.clip(pixels[..., :3] * np.float32(self._gain), 0, limit), depth
-
-
-class _SceneObstacles:
-    """The surfaces of an open file, which cameras must keep away from. Lengths are in meters."""
-
-    def __init__(self, scene: Any, depsgraph: Any, scale: float) -> None:
-        self._scene, self._depsgraph, self._scale = scene, depsgraph, scale
 
     def _hit(self, origin: Array, direction: Array, reach: float) -> float:
         """Return how far a ray goes before it hits a surface, inf if farther than ``reach``."""

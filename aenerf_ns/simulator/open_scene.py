@@ -207,10 +207,10 @@ def _load_blend(path: Path, file: Path, values: _SceneFile, seed: int) -> Simula
     camera_path: CameraPath
     if track is not None:
         # A gaze that turns by more would leave what the camera looks at.
-        camera_path, duration = TrackPath(track.poses, 0.31 / focal_ratio, renderer.obstacles), track.duration
+        camera_path, duration = TrackPath(track.poses, 0.31 / focal_ratio, renderer), track.duration
     else:
         route = route or _Around()
-        camera_path, duration = _make_path(path, route, renderer.bounds, renderer.obstacles), route.duration
+        camera_path, duration = _make_path(path, route, renderer.bounds, renderer), route.duration
     scene = SimulationScene(
         renderer,
         camera_path,

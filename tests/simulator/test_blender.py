@@ -102,8 +102,8 @@ def test_radiance_and_depth(blend: Path, scale: float) -> None:
         # Denoising leaves an even sky as it is, up to the rim.
         np.testing.assert_allclose(radiance, radiance[0, 0].mean(), rtol=0.01)
     np.testing.assert_allclose(renderer.bounds, [[-9 * scale, -9 * scale, 0], [9 * scale, 9 * scale, scale]])
-    assert renderer.obstacles.distance([[0, 0, -4 * scale]]) == pytest.approx(4 * scale)
-    assert renderer.obstacles.blocked(np.array([[0, 0, 2, 0, 0, -3], [0, 0, 2, 0, 0, -0.5]]) * scale).tolist() == [1, 0]
+    assert renderer.distance([[0, 0, -4 * scale]]) == pytest.approx(4 * scale)
+    assert renderer.blocked(np.array([[0, 0, 2, 0, 0, -3], [0, 0, 2, 0, 0, -0.5]]) * scale).tolist() == [1, 0]
 
 
 def test_still_camera_fires_no_events(blend: Path) -> None:
@@ -208,7 +208,7 @@ def test_a_linked_object_is_found_and_a_hidden_collection_is_an_obstacle(blend: 
     for name in ("elsewhere", "moved"):
         renderer = BlenderRenderer(blend)
         assert renderer.bounds[1, 2] == pytest.approx(9)
-        assert renderer.obstacles.blocked(np.array([[0.5, 0.5, 2, 0, 0, -1.5], [4, 0, 4, 0, 8, 0]])).tolist() == [1, 1]
+        assert renderer.blocked(np.array([[0.5, 0.5, 2, 0, 0, -1.5], [4, 0, 4, 0, 8, 0]])).tolist() == [1, 1]
         if name == "elsewhere":
             folder.rename(tmp_path / "moved")
     (tmp_path / "moved/tower.blend").unlink()
