@@ -45,7 +45,10 @@ def make_page(
     rows = view_rows(reports)
     different_data: dict[tuple, RunReport] = {}
     for report in reports:
-        different_data.setdefault((report.config["data"], *report.config["window_ns"]), report)
+        key = report.config["data"], *report.config["window_ns"]
+        # Runs of some methods have no account of pairs.
+        if key not in different_data or different_data[key].num_pairs is None:
+            different_data[key] = report
     return template.render(
         reports=reports,
         descriptions=[describe_run(report) for report in reports],

@@ -138,4 +138,7 @@ def test_page_compares_runs_on_shared_views() -> None:
     # The same data once, and four pictures for each run.
     assert page.count("All that aenerf check says") == 1
     assert page.count("<figure>") == 3 + 2 * 4
+    # Of windows, say, which have no account of pairs.
+    without_pairs = make_report("a", num_pairs=None, drift=None, pairs=None)
+    assert page_of([without_pairs, second], shared).count("Pairs: 1000 pairs.") == 1
     assert "No test view is in all runs" in page_of([first, second], [])
