@@ -131,6 +131,8 @@ class PoseCorrection(CameraOptimizer):
             self.twists = TwistNetwork(trajectory)
         elif config.mode == "spline":
             self.twists = TwistSpline(trajectory.duration, config.knot_interval)
+        if self.twists is not None:
+            self.span: Tensor = nn.Buffer(torch.tensor([trajectory.start, trajectory.end]))
 
     @property
     def is_learned(self) -> bool:
@@ -184,11 +186,16 @@ class PoseCorrection(CameraOptimizer):
         return (self.on_clock_of_poses(seconds) == seconds + self.clock_offset())[:, None, None]
 
     def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any) -> None:
-        # The learned change counts from the start value. Checkpoints of earlier versions hold no start value.
+        # The learned change counts from the start value. Checkpoints of earlier versions hold neither it nor the span.
         if self.clock_change is not None:
             start = float(state_dict.setdefault(f"{prefix}clock_start", self.clock_start))
             if start != self.config.clock_offset:
                 args[-1].append(f"it began with clock-offset {start:g}, not {self.config.clock_offset:g}")
+        # Twists count their times from the start, so they would correct poses of other times.
+        if self.twists is not None:
+            learned, own = state_dict.setdefault(f"{prefix}span", self.span).tolist(), self.span.tolist()
+            if learned != own:
+                args[-1].append("its corrections are of poses from {} to {} ns, not {} to {} ns".format(*learned, *own))
         super()._load_from_state_dict(state_dict, prefix, *args)
 
     def _rigid_twists(self, count: int) -> Tensor:

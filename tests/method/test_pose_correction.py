@@ -107,6 +107,18 @@ def test_a_learned_clock_offset_belongs_to_its_start() -> None:
         assert again.offsets() == first.offsets()
 
 
+@pytest.mark.parametrize("mode", ["network", "spline"])
+def test_twists_belong_to_the_times_of_their_poses(mode: str) -> None:
+    trajectory = _trajectory()
+    later = Trajectory(trajectory.times + 5, trajectory.camera_to_worlds)
+    state, other = _correction(mode=mode).state_dict(), make_correction(later, mode=mode)
+    with pytest.raises(RuntimeError, match="its corrections are of poses from 0 to 2000000000 ns, not 5 to 2000000005"):
+        other.load_state_dict(state)
+    # Checkpoints of earlier versions do not have it.
+    del state["span"]
+    other.load_state_dict(state)
+
+
 @torch.no_grad()
 def test_many_poses_are_those_of_few() -> None:
     correction = _correction(mode="network")
