@@ -70,7 +70,8 @@ class AENeRFPipeline(VanillaPipeline):
                 require_camera_path()
         super().__init__(config, device, test_mode=test_mode, **kwargs)
         self._pose_diagnosis: dict[str, Any] | None = None
-        self.training_state = TrainingState()
+        data = self.datamanager
+        self.training_state = TrainingState(data.train_dataset.scene.frame, Path(data.get_datapath()))
         if test_mode != "inference":
             self.datamanager.supervise(self.model.supervision)
         # Made ahead of training: this run's diagnosis stays empty, and the fit does not read it.
@@ -85,8 +86,10 @@ class AENeRFPipeline(VanillaPipeline):
 
         Raises:
             RuntimeError: the checkpoint belongs to a model with other parameters.
+            SystemExit: with one clear line, when it belongs to a scene that is elsewhere.
         """
-        super().load_state_dict(state_dict, strict=True)
+        with errors_as_one_line():
+            super().load_state_dict(state_dict, strict=True)
         if self.test_mode != "val":
             # The framework's renderers and exporters derive their own cameras from these cameras.
             self.datamanager.place_cameras(self.model.camera_optimizer)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -9,9 +10,9 @@ from nerfstudio.engine.trainer import Trainer
 from nerfstudio.utils import comms
 from torch import nn
 
+from aenerf_ns.camera.alignment import Similarity
 from aenerf_ns.errors import DataError
 from aenerf_ns.method.ray_samplers import ProposalSampler
-from aenerf_ns.recording.dataset import EventDataset
 
 
 class TrainingState(nn.Module):
@@ -20,10 +21,17 @@ class TrainingState(nn.Module):
     The state holds torch's random generators, the gradients that are being accumulated over steps
     (``gradient_accumulation_steps``), the step at which the proposal networks were last trained, the number of steps
     that the schedules are made for, and where the scene is in the world of the recording.
+
+    Args:
+        scene_frame: takes the world of the recording to the scene.
+        data: the dataset, for error messages.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, scene_frame: Similarity, data: Path) -> None:
         super().__init__()
+        # (3, 4) float64. The rotation is scaled.
+        self._scene_frame = torch.cat([scene_frame.scale * scene_frame.rotation, scene_frame.translation[:, None]], -1)
+        self._data = data
         self._training: tuple[Trainer, ProposalSampler] | None = None
         self._loaded: dict[str, Any] | None = None
 
@@ -44,11 +52,24 @@ class TrainingState(nn.Module):
             "gradients": accumulating,
             "proposal_sampler": sampler.schedule_state(),
             "schedule_length": trainer.config.schedule_length,
-            "scene_frame": _scene_frame(trainer),
+            "scene_frame": self._scene_frame,
         }
 
     def set_extra_state(self, state: dict[str, Any] | None) -> None:
-        """Take a checkpoint's state, for :meth:`resume`: evaluations load it too, and it must not affect them."""
+        """Take a checkpoint's state, for :meth:`resume`. Evaluations load it too, and it does not affect them.
+
+        Raises:
+            DataError: the checkpoint is of a scene that is elsewhere: its field and corrections would be, too.
+        """
+        # Checkpoints of earlier versions do not say.
+        before, now = None if state is None else state.get("scene_frame"), self._scene_frame
+        if before is not None and not torch.allclose(before, now, rtol=1e-5, atol=1e-5 * float(now.abs().max())):
+            raise DataError(
+                self._data,
+                "its scene is scaled, turned or moved otherwise than that of the checkpoint (scene units to a unit of "
+                f"the recording: {now[:, 0].norm():.5g}, there {before[:, 0].norm():.5g})",
+                "give the dataset, time window, scale and other options of the format of the first run, or train again",
+            )
         self._loaded = state
 
     def resume(self, trainer: Trainer, sampler: ProposalSampler) -> None:
@@ -57,23 +78,11 @@ class TrainingState(nn.Module):
         Args:
             trainer: of an :class:`~aenerf_ns.training.trainer.AENeRFTrainerConfig`, with its checkpoint loaded.
             sampler: of the model that is trained.
-
-        Raises:
-            DataError: the checkpoint is of a scene that is elsewhere: its field and corrections would be, too.
         """
         self._training = (trainer, sampler)
         state, self._loaded = self._loaded, None
         if state is None:
             return
-        # Checkpoints of earlier versions do not say.
-        before, now = state.get("scene_frame"), _scene_frame(trainer)
-        if before is not None and not torch.allclose(before, now, rtol=1e-5, atol=1e-5 * float(now.abs().max())):
-            raise DataError(
-                str(trainer.config.load_checkpoint),
-                "its scene is scaled, turned or moved otherwise (scene units to a unit of the recording: "
-                f"{before[:, 0].norm():.5g}, here {now[:, 0].norm():.5g})",
-                "give the dataset, time window, scale and other options of the format of the first run, or train again",
-            )
         for group, gradients in state["gradients"].items():
             for parameter, gradient in zip(trainer.optimizers.parameters[group], gradients, strict=True):
                 parameter.grad = None if gradient is None else gradient.to(parameter)
@@ -86,14 +95,6 @@ class TrainingState(nn.Module):
         if not comms.is_main_process():
             # The main process alone writes checkpoints. The others must draw batches of their own.
             torch.manual_seed(int(torch.randint(1 << 62, ())) + comms.get_rank())
-
-
-def _scene_frame(trainer: Trainer) -> torch.Tensor:
-    """Return the (3, 4) float64 map from the recording's world to the scene's: its rotation is scaled."""
-    dataset = trainer.pipeline.datamanager.train_dataset
-    assert isinstance(dataset, EventDataset)
-    frame = dataset.scene.frame
-    return torch.cat([frame.scale * frame.rotation, frame.translation[:, None]], -1)
 
 
 def _is_on_gpu(trainer: Trainer) -> bool:

@@ -16,6 +16,7 @@ import torch
 from helpers.small_trainings import train_small_model
 from nerfstudio.engine import trainer as framework_trainer
 from nerfstudio.engine.trainer import Trainer
+from nerfstudio.utils.eval_utils import eval_setup
 from torch.utils._pytree import keystr, tree_flatten_with_path
 
 from aenerf_ns.report.run_files import read_scalars
@@ -63,13 +64,16 @@ def test_run_in_two_pieces_equals_one(tmp_path: Path) -> None:
         train_small_model(tmp_path, "other", 1, load_dir=first.checkpoint_dir)
 
 
-def test_resuming_with_a_scene_elsewhere_is_refused(tmp_path: Path) -> None:
+def test_a_checkpoint_with_a_scene_elsewhere_is_refused(tmp_path: Path) -> None:
     first = train_small_model(tmp_path, "first", 1)
     path = tmp_path / "data" / "trajectory_estimated.txt"
     # Training scales the poses to one unit.
     path.write_text(path.read_text().replace("0.10000000149", "0.2"))
-    with pytest.raises(SystemExit, match=r"^Error: \S+\.ckpt: its scene is scaled, .*: 10, here 5\); give the dataset"):
+    line = r"^Error: \S+data: its scene is scaled, .*: 5, there 10\); give the dataset"
+    with pytest.raises(SystemExit, match=line):
         train_small_model(tmp_path, "second", 1, load_dir=first.checkpoint_dir)
+    with pytest.raises(SystemExit, match=line):
+        eval_setup(first.base_dir / "config.yml")
 
 
 @pytest.mark.parametrize("counts_earlier_steps", [False, True])
