@@ -136,9 +136,9 @@ class Convert(DatasetCommand):
         camera = recording.event_camera
         if self.region is not None:
             camera = camera.crop(*self.region)
-        mount = None if recording.has_own_frames else recording.frame_from_event
-        cameras = (camera, recording.frame_camera, mount)
-        with open_writer(lock, parser, recording, *cameras, has_given_poses) as writer:
+        cameras = (camera, recording.frame_camera)
+        motion = recording.frame_from_event
+        with open_writer(lock, parser, recording, *cameras, has_given_poses, frame_from_event=motion) as writer:
             writer.add_trajectories(trajectory, recording.ground_truth)
             if report is None:
                 writer.copy_poses_report(trajectory)
@@ -274,7 +274,7 @@ def _with_poses(
     # In place of what a dataset has: its scene box is in the world of its own poses, and its longest gap about these.
     new: dict[str, Any] = {"trajectory": trajectory, "scene_box": found.scene_box, "max_pose_gap": found.max_pose_gap()}
     if capture.intrinsics_origin == "guessed":
-        if capture.frame_camera == capture.event_camera:
+        if capture.has_own_frames:
             capture = replace(capture, frame_camera=found.camera)
         capture = replace(capture, event_camera=found.camera, intrinsics_origin="estimated")
         report["intrinsics"] = found.camera.to_transforms()
@@ -305,9 +305,10 @@ def _with_poses(
             f"{trajectory.start} to {trajectory.end} ns: they are left out."
         )
     placed = [(time, file) for time, file in images if trajectory.start <= time <= trajectory.end]
-    if placed and not capture.has_own_frames:
+    if not capture.has_own_frames:
+        if images:
+            say("The recording's images are left out: they are of another camera than the events.")
         # In a world without scale, nothing tells how far one camera is from the other.
-        say("The recording's images are left out: they are of another camera than the events.")
         placed, capture = [], replace(capture, frame_from_event=None)
     views = views_on_trajectory(placed, trajectory)
     camera = {field.name: getattr(capture, field.name) for field in fields(Capture)}

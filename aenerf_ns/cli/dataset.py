@@ -108,8 +108,8 @@ def open_writer(
     recording: Recording,
     event_camera: CameraIntrinsics,
     frame_camera: CameraIntrinsics,
-    frame_from_event: Tensor | None = None,
     has_metric_poses: bool = True,
+    frame_from_event: Tensor | None = None,
 ) -> NativeDatasetWriter:
     """Open a dataset folder for what a command makes of a recording, in the world of the recording.
 

@@ -76,8 +76,8 @@ def summarize(figures: dict[str, Any]) -> str:
         part = figures["stretches"][worst]
         signs.append(
             f"weak stretches: {num_weak} of {len(shares)}, the worst from {part['start_seconds']:.3g} to "
-            f"{part['end_seconds']:.3g} s with {shares[worst]:.0%} of the loss of a constant field (refine the poses "
-            "first with aenerf convert --poses refined, train longer, or expect noise)"
+            f"{part['end_seconds']:.3g} s with {shares[worst]:.0%} of the loss of a constant field (train with poses "
+            "that aenerf convert --poses refined has mended, train longer, or expect noise)"
         )
     verdict = f"Signs of failure: {'; '.join(signs)}" if signs else "No sign of failure"
     return f"{line}. {verdict}."

@@ -40,8 +40,8 @@ def read_json(path: Path, kind: type[T], remedy: str = DATASET_REMEDY) -> T:
     """Read a JSON file that holds a struct, or any other type (``kind``) that msgspec knows.
 
     Raises:
-        DataError: the file is missing or too large, is not JSON, has a key twice or a number that is too large, or
-            holds something else than ``kind``.
+        DataError: the file is missing or too large, is not JSON, has a key twice, a number that is too large or not
+            finite, or holds something else than ``kind``.
     """
     text = read_text(path, _MAX_BYTES)
     try:
@@ -103,7 +103,7 @@ def _parse_decimal(text: str) -> Decimal:
     except ArithmeticError:
         value = None
     if value is None or not value.is_finite() or value.adjusted() > _MAX_EXPONENT:
-        raise ValueError(f"the number {text[:40]} is not finite, or too large")
+        raise ValueError(f"the number {text[:40]} is too large, or not finite")
     return value
 
 

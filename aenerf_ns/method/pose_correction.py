@@ -19,6 +19,7 @@ from aenerf_ns.camera.alignment import Similarity, align
 from aenerf_ns.camera.metadata_keys import CAMERA_DIRECTIONS, REFERENCE_SECONDS, TRAJECTORY_SECONDS
 from aenerf_ns.camera.rotation import TwistExponential
 from aenerf_ns.camera.trajectory import Trajectory, homogeneous
+from aenerf_ns.errors import DataError
 
 # Poses at which trajectories are compared: enough for any metric, few enough to be logged quickly.
 _MAX_COMPARED = 2000
@@ -80,6 +81,7 @@ class PoseCorrection(CameraOptimizer):
 
     Attributes:
         translation_unit: the trajectory's extent, by which translations are counted, in scene units.
+        span: (2,) times of the first and the last given pose in nanoseconds, where twists are learned.
     """
 
     config: PoseCorrectionConfig
@@ -195,7 +197,9 @@ class PoseCorrection(CameraOptimizer):
         if self.twists is not None:
             learned, own = state_dict.setdefault(f"{prefix}span", self.span).tolist(), self.span.tolist()
             if learned != own:
-                args[-1].append("its corrections are of poses from {} to {} ns, not {} to {} ns".format(*learned, *own))
+                problem = "its poses are from {} to {} ns, and the corrections of poses from {} to {} ns"
+                remedy = "give the poses and the time window of the run, or train again"
+                raise DataError(self.trajectory.source, problem.format(*own, *learned), remedy)
         super()._load_from_state_dict(state_dict, prefix, *args)
 
     def _rigid_twists(self, count: int) -> Tensor:

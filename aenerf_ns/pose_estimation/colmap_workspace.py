@@ -203,7 +203,7 @@ class ColmapWorkspace:
         """Take the matches of a share of the pairs of frames out of the database, to judge models by."""
         with pycolmap.Database.open(self._database) as database:
             camera = database.read_all_cameras()[0]
-            self._focal_length = camera.mean_focal_length()
+            self._focal_length, self.held_out = camera.mean_focal_length(), []
             pair_ids, geometries = database.read_two_view_geometries()
             chosen = np.random.default_rng(self._seed).random(len(pair_ids)) < share
             for pair_id, geometry, is_chosen in zip(pair_ids, geometries, chosen, strict=True):

@@ -92,7 +92,8 @@ class EventDataParser(DataParser):
         with reading(self.data):
             if self._lacks_poses():
                 capture, frames = self.read_capture()
-                require_distinct_times([time for time, _ in frames], self.data)
+                if capture.has_own_frames:
+                    require_distinct_times([time for time, _ in frames], self.data)
                 capture.event_file.drop_malformed = self.config.drop_malformed
                 self._check_lens(capture.event_camera, "event camera")
                 return capture, sorted(frames)

@@ -51,7 +51,7 @@ class Capture:
         intrinsics_origin: where the event camera's lens comes from. A guessed one has to be estimated together with the
             poses.
         frame_from_event: (4, 4) float64, takes points from the event camera's to the frame camera's coordinates, where
-            the dataset states it.
+            the format keeps it.
     """
 
     event_file: EventFile

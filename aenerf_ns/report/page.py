@@ -47,7 +47,7 @@ def make_page(
     for report in reports:
         key = report.config["data"], *report.config["window_ns"]
         # Runs of some methods have no account of pairs.
-        if key not in different_data or different_data[key].num_pairs is None:
+        if key not in different_data or (different_data[key].num_pairs is None and report.num_pairs is not None):
             different_data[key] = report
     return template.render(
         reports=reports,

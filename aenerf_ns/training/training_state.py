@@ -68,7 +68,7 @@ class TrainingState(nn.Module):
                 self._data,
                 "its scene is scaled, turned or moved otherwise than that of the checkpoint (scene units to a unit of "
                 f"the recording: {now[:, 0].norm():.5g}, there {before[:, 0].norm():.5g})",
-                "give the dataset, time window, scale and other options of the format of the first run, or train again",
+                "give the dataset, time window, scale and other options of the format of that run, or train again",
             )
         self._loaded = state
 

@@ -63,6 +63,8 @@ def test_a_pixel_of_a_color_sensor_is_compared_with_its_own_channel(tmp_path: Pa
         Image.fromarray(np.ascontiguousarray(picture)).save(file)
     camera, sensor = CameraIntrinsics(WIDTH, HEIGHT, 40.0, 40.0, 20.0, 15.0), SensorModel(0.1, 0.1, 0, "RGGB")
     capture = SimpleNamespace(sensor=sensor, event_camera=camera, has_own_frames=True, image_encoding="linear")
+    other = SimpleNamespace(**vars(capture) | {"has_own_frames": False})
+    assert FrameChanges(other, frames, TimeWindow()).correlation() is None
     changes = FrameChanges(capture, frames, TimeWindow())
     rows, columns = np.nonzero(sensor.channels(WIDTH, HEIGHT) != 1)
     polarities = (1 - sensor.channels(WIDTH, HEIGHT)[rows, columns]).astype(np.int8)

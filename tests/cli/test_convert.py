@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 from helpers.colmap_stand_in import FOUND_BOX, place_frames
-from helpers.dataset_faults import set_in
+from helpers.dataset_faults import MOUNTED_APART, OTHER_LENS, Change
 from helpers.event_file_checks import read
 from helpers.own_recordings import random_events, write_calibration, write_poses
 from helpers.small_datasets import END, START, make_trajectory, write_ecd, write_native
@@ -229,13 +229,14 @@ def test_images_of_another_camera_are_left_out_of_poses_from_events(
 ) -> None:
     find_three_poses(monkeypatch, START)
     data = write_native(tmp_path / "made")
-    set_in("transforms.json", "fl_x", value=4.0)(data)
+    MOUNTED_APART(data)
     for name in ("estimated", "ground_truth"):
         (data / f"trajectory_{name}.txt").unlink()
     with CONSOLE.capture() as output:
         found = convert(data, tmp_path / "found", poses="events")
     assert "The recording's images are left out: they are of another camera than the events." in output.get()
     assert not any(found.reference_views.values())
+    assert found.frame_from_event is None
 
 
 def test_given_poses_of_another_time_are_left_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -295,15 +296,10 @@ def test_the_report_on_poses_stays_with_them(tmp_path: Path) -> None:
         assert (tmp_path / "twice" / name).read_bytes() == (data / name).read_bytes()
 
 
-SHIFT = [[1, 0, 0, 0.1], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
-
-
-# Two cameras of one kind may have the same lens.
-@pytest.mark.parametrize("change", [("fl_x", 4.0), ("event_camera", "T_frame_event", SHIFT)])
-def test_frames_of_another_camera_give_no_poses(change: tuple, tmp_path: Path) -> None:
-    *place, value = change
+@pytest.mark.parametrize("change", [OTHER_LENS, MOUNTED_APART])
+def test_frames_of_another_camera_give_no_poses(change: Change, tmp_path: Path) -> None:
     data = write_native(tmp_path / "made")
-    set_in("transforms.json", *place, value=value)(data)
+    change(data)
     assert not convert(data, tmp_path / "given").has_own_frames
     with pytest.raises(DataError, match="frames are of another camera than its events"):
         convert(data, tmp_path / "converted", poses="colmap")

@@ -8,7 +8,7 @@ import imageio_ffmpeg
 import numpy as np
 import pytest
 import torch
-from helpers.dataset_faults import set_in
+from helpers.dataset_faults import MOUNTED_APART, OTHER_LENS, Change, set_in
 from helpers.small_datasets import AS_RECORDED, START, parse, write_native
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 from PIL import Image
@@ -110,8 +110,11 @@ def test_images_without_a_pose_are_left_out(data: Path, tmp_path: Path, capsys: 
     assert f"{25 - len(views)} of 25 images are left out" in capsys.readouterr().out
 
 
-def test_images_of_another_camera_are_left_out(data: Path, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
-    set_in("transforms.json", "fl_x", value=4.0)(data)
+@pytest.mark.parametrize("change", [OTHER_LENS, MOUNTED_APART])
+def test_images_of_another_camera_are_left_out(
+    change: Change, data: Path, tmp_path: Path, capsys: pytest.CaptureFixture
+) -> None:
+    change(data)
     Reconstruct(data, tmp_path / "out").main()
     views = opened(tmp_path / "out").reference_views
     assert [len(views[split]) for split in ("train", "val", "test")] == [25, 0, 0]

@@ -172,3 +172,10 @@ def saved_as(format: str, name: str, size: tuple[int, int] = (6, 4), mode: str =
 def read_everything(config: EventDataParserConfig) -> None:
     config.setup().get_dataparser_outputs("val")
     assert len(EventDataset(config.setup().get_dataparser_outputs("train")).pairs)
+
+
+OTHER_LENS = set_in("transforms.json", "fl_x", value=4.0)
+MOUNTED_APART = set_in(
+    "transforms.json", "event_camera", "T_frame_event", value=[[1, 0, 0, 0.1], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
+)
+"""Changes of a dataset folder after which its images are of another camera. Cameras of one kind may share a lens."""

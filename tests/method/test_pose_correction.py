@@ -11,6 +11,7 @@ from torch import Tensor
 
 from aenerf_ns.camera.rotation import motion_from_twist
 from aenerf_ns.camera.trajectory import Trajectory, homogeneous
+from aenerf_ns.errors import DataError
 from aenerf_ns.method.pose_correction import PoseCorrection, world_rays
 
 _RIGID = torch.tensor([0.01, -0.02, 0.015, 0.02, 0.03, -0.01], dtype=torch.float64)
@@ -112,7 +113,8 @@ def test_twists_belong_to_the_times_of_their_poses(mode: str) -> None:
     trajectory = _trajectory()
     later = Trajectory(trajectory.times + 5, trajectory.camera_to_worlds)
     state, other = _correction(mode=mode).state_dict(), make_correction(later, mode=mode)
-    with pytest.raises(RuntimeError, match="its corrections are of poses from 0 to 2000000000 ns, not 5 to 2000000005"):
+    line = "its poses are from 5 to 2000000005 ns, and the corrections of poses from 0 to 2000000000 ns; give"
+    with pytest.raises(DataError, match=line):
         other.load_state_dict(state)
     # Checkpoints of earlier versions do not have it.
     del state["span"]

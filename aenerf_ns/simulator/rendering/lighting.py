@@ -164,7 +164,7 @@ def light_mesh(
 
 
 def baked_mesh(mesh: Mesh, background: Array | None) -> Renderer:
-    """Return a renderer of a mesh whose colors are radiance, in front of a uniform background (3,)."""
+    """Return a renderer of a mesh whose colors are radiance, in front of a uniform background (3,) or of black."""
     surface, light = make_surface(mesh, np.zeros_like(mesh.faces)), np.ones((2, 1, 3), np.float32)
     return Renderer(surface, mesh.caster, light, background, mip_maps([], bits16=False))
 
