@@ -10,9 +10,9 @@ from nerfstudio.engine.trainer import Trainer
 from nerfstudio.utils import comms
 from torch import nn
 
-from aenerf_ns.camera.alignment import Similarity
 from aenerf_ns.errors import DataError
 from aenerf_ns.method.ray_samplers import ProposalSampler
+from aenerf_ns.recording.scene import SceneRecording
 
 
 class TrainingState(nn.Module):
@@ -23,14 +23,15 @@ class TrainingState(nn.Module):
     that the schedules are made for, and where the scene is in the world of the recording.
 
     Args:
-        scene_frame: takes the world of the recording to the scene.
+        scene: that is trained on.
         data: the dataset, for error messages.
     """
 
-    def __init__(self, scene_frame: Similarity, data: Path) -> None:
+    def __init__(self, scene: SceneRecording, data: Path) -> None:
         super().__init__()
-        # (3, 4) float64. The rotation is scaled.
-        self._scene_frame = torch.cat([scene_frame.scale * scene_frame.rotation, scene_frame.translation[:, None]], -1)
+        frame = scene.frame
+        # The (3, 4) float64 map from the recording's world to the scene's: its rotation is scaled.
+        self._scene_frame = torch.cat([frame.scale * frame.rotation, frame.translation[:, None]], -1)
         self._data = data
         self._training: tuple[Trainer, ProposalSampler] | None = None
         self._loaded: dict[str, Any] | None = None
