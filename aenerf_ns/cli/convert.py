@@ -136,9 +136,7 @@ class Convert(DatasetCommand):
         camera = recording.event_camera
         if self.region is not None:
             camera = camera.crop(*self.region)
-        cameras = (camera, recording.frame_camera)
-        motion = recording.frame_from_event
-        with open_writer(lock, parser, recording, *cameras, has_given_poses, frame_from_event=motion) as writer:
+        with open_writer(lock, parser, recording, camera, recording.frame_camera, has_given_poses) as writer:
             writer.add_trajectories(trajectory, recording.ground_truth)
             if report is None:
                 writer.copy_poses_report(trajectory)
@@ -304,12 +302,12 @@ def _with_poses(
             f"The given poses, from {truth.start} to {truth.end} ns, are of another time than the estimated ones, from "
             f"{trajectory.start} to {trajectory.end} ns: they are left out."
         )
-    placed = [(time, file) for time, file in images if trajectory.start <= time <= trajectory.end]
     if not capture.has_own_frames:
         if images:
             say("The recording's images are left out: they are of another camera than the events.")
         # In a world without scale, nothing tells how far one camera is from the other.
-        placed, capture = [], replace(capture, frame_from_event=None)
+        images, capture = [], replace(capture, frame_from_event=None)
+    placed = [(time, file) for time, file in images if trajectory.start <= time <= trajectory.end]
     views = views_on_trajectory(placed, trajectory)
     camera = {field.name: getattr(capture, field.name) for field in fields(Capture)}
     recording = Recording(**camera, **new, reference_views=views, max_views=MAX_VIEWS)

@@ -109,7 +109,6 @@ def open_writer(
     event_camera: CameraIntrinsics,
     frame_camera: CameraIntrinsics,
     has_metric_poses: bool = True,
-    frame_from_event: Tensor | None = None,
 ) -> NativeDatasetWriter:
     """Open a dataset folder for what a command makes of a recording, in the world of the recording.
 
@@ -125,7 +124,7 @@ def open_writer(
         scene_box=recording.scene_box,
         max_pose_gap=recording.max_pose_gap,
         frame_camera=frame_camera,
-        frame_from_event=frame_from_event,
+        frame_from_event=recording.frame_from_event,
         # Near and far planes keep their units.
         auto_scale_poses=parser.scales_poses(recording) or not has_metric_poses,
         has_estimated_intrinsics=recording.intrinsics_origin == "estimated",

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -61,7 +61,9 @@ class Reconstruct(DatasetCommand):
         recording = parser.recording
         source = self._source(recording)
         camera = recording.event_camera
-        with open_writer(lock, parser, recording, camera, camera) as writer:
+        # The images are made of the events, and are the event camera's own.
+        made_by_events = replace(recording, frame_from_event=None)
+        with open_writer(lock, parser, made_by_events, camera, camera) as writer:
             writer.add_trajectories(recording.trajectory, recording.ground_truth)
             writer.copy_poses_report(recording.trajectory)
             _add_reference_views(recording, writer)
