@@ -86,7 +86,9 @@ class OwnRecordingDataParser(EventDataParser):
 
     def read_recording(self) -> Recording:
         config = self.config
-        capture, frame_from_event, timed = self._read_all_but_poses()
+        capture, timed = self.read_capture()
+        frame_from_event = capture.frame_from_event
+        assert frame_from_event is not None
         poses = self.poses_path()
         if poses == config.colmap or poses.is_dir():
             if not timed:
@@ -111,12 +113,6 @@ class OwnRecordingDataParser(EventDataParser):
         return stated or (model if model.is_dir() and not trajectory.is_file() else trajectory)
 
     def read_capture(self) -> tuple[Capture, list[tuple[int, Path]]]:
-        capture, _, timed = self._read_all_but_poses()
-        return capture, timed
-
-    def _read_all_but_poses(self) -> tuple[Capture, Tensor, list[tuple[int, Path]]]:
-        """Read the cameras, the (4, 4) motion from the event camera's to the frame camera's coordinates, and the times
-        in nanoseconds and the files of the images."""
         config = self.config
         if not self._folder.is_dir():
             raise DataError(self._folder, "there is no such folder", "give the folder of the recording as --data")
@@ -133,7 +129,7 @@ class OwnRecordingDataParser(EventDataParser):
             intrinsics_origin=calibration.intrinsics_origin,
             frame_from_event=calibration.frame_from_event,
         )
-        return capture, calibration.frame_from_event, timed
+        return capture, timed
 
     @property
     def _folder(self) -> Path:
