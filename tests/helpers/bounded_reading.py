@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import codecs
 import os
 import resource
 import time
@@ -15,6 +16,10 @@ from aenerf_ns.errors import DataError
 # A refusal may take this much memory, beyond what the process has, and this much CPU time. On a slow machine it may
 # take as long as the machine needs to unpack the last number of bytes, because seconds alone would measure the machine.
 MAX_BYTES, MAX_SECONDS, _MAX_UNPACKED = 1 << 30, 2.0, 2 << 30
+
+# h5py looks this codec up. Where others than root may not read the interpreter's files, a look-up without the rights of
+# root fails, and Python remembers that there is no such codec.
+codecs.lookup("ascii")
 
 
 @contextmanager
