@@ -211,6 +211,16 @@ def test_displacements_are_those_of_the_flow_and_are_zero_where_nothing_happens(
         assert batch.displacement[index].numpy() == pytest.approx(expected, rel=1e-5), index
 
 
+def test_poses_without_events_leave_the_flow_after_the_gap_as_it_is(
+    random_poses: torch.Tensor, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("aenerf_ns.events.optical_flow.optical_flow", lambda events: (np.array(len(events)), 4))
+    events = make_events()
+    sampler = make_sampler(random_poses, events=events[events.t > GAP[1]])
+    assert sampler._flow(int(KNOTS[0]))[0] == 0
+    assert sampler._flow(GAP[1])[0] > 0
+
+
 def test_a_window_has_a_patch_at_least(random_poses: torch.Tensor) -> None:
     _, batch = make_sampler(random_poses, pixels_per_window=1).sample(8 * 5)
     assert batch.window.tolist() == np.repeat(np.arange(5), 4).tolist()

@@ -172,8 +172,8 @@ class FlowPatchSampler(WindowSampler):
         self, config: WindowSamplerConfig, dataset: EventDataset, supervision: Supervision, device: torch.device | str
     ) -> None:
         super().__init__(config, dataset, supervision, device)
-        # Velocities of the tiles and side of a tile, by the index of the first event of a stretch.
-        self._flows: dict[int, tuple[NDArray[np.float64], int]] = {}
+        # Velocities of the tiles and side of a tile, by the first event of a stretch and the one after its last.
+        self._flows: dict[tuple[int, int], tuple[NDArray[np.float64], int]] = {}
         usable = self.pixel_rays.usable
         height, width = usable.shape
         pixels = np.arange(height * width).reshape(height, width)[: height // 2 * 2, : width // 2 * 2]
@@ -221,6 +221,8 @@ class FlowPatchSampler(WindowSampler):
         last = np.searchsorted(windows.times, piece[1], side="right")
         size = int(_FLOW_DENSITY * height * width)
         begin = int(max(min(at - (at - first) % size, last - size), first))
-        if begin not in self._flows:
-            self._flows[begin] = optical_flow(windows.events(slice(begin, min(begin + size, last))))
-        return self._flows[begin]
+        # Where the poses between two gaps have no events, the next ones' first stretch begins at the same index.
+        stretch = begin, int(min(begin + size, last))
+        if stretch not in self._flows:
+            self._flows[stretch] = optical_flow(windows.events(slice(*stretch)))
+        return self._flows[stretch]
