@@ -58,6 +58,17 @@ def test_a_pixel_has_the_value_of_its_image_and_the_ray_of_its_time(
     assert len(set(zip(frames.tolist(), pixels, strict=True))) == 36
 
 
+def test_a_monochrome_sensor_learns_the_luminance_that_metrics_compare_with(
+    random_poses: torch.Tensor, tmp_path: Path
+) -> None:
+    sampler = make_sampler(tmp_path, random_poses)
+    for index in range(len(SECONDS)):
+        Image.new("RGB", (4, 3), "blue").save(tmp_path / f"{index}.png")
+    _, batch = sampler.sample(10)
+    # 0.0722 of the linear radiance.
+    assert (255 * batch.values).round().unique().tolist() == [76]
+
+
 def test_the_loss_is_the_squared_error_of_display_values() -> None:
     supervision = make_supervision(FrameSupervision, SensorModel())
     values = torch.tensor([[0.2], [0.5], [0.0]])

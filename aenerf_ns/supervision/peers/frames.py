@@ -12,8 +12,11 @@ import torch
 import torch.nn.functional as F
 from nerfstudio.cameras.rays import RayBundle
 from nerfstudio.utils.rich_utils import CONSOLE
+from numpy.typing import NDArray
+from PIL import Image
 from torch import Tensor
 
+from aenerf_ns.camera.image_encoding import ImageEncoding, decode, encode, to_channels
 from aenerf_ns.errors import DataError
 from aenerf_ns.recording.images import check_image, read_image
 from aenerf_ns.supervision.base import Batch, Sampler, Supervision
@@ -68,11 +71,10 @@ class FrameSampler(Sampler):
                 "it has no training images that the event camera took at known times",
                 "make some with aenerf reconstruct",
             )
-        mode = "L" if scene.sensor.num_channels == 1 else "RGB"
         values = []
         for _, file in scene.frames:
             check_image(file, scene.event_camera)
-            values.append(np.asarray(read_image(file).convert(mode)).reshape(-1, scene.sensor.num_channels))
+            values.append(_as_seen(read_image(file), scene.sensor.num_channels, scene.image_encoding))
         line = f"Training on {len(values)} images, the first of them {scene.frames[0][1]}."
         CONSOLE.print(line, markup=False, soft_wrap=True)
         times = torch.tensor([time for time, _ in scene.frames], device=self.device)
@@ -86,3 +88,14 @@ class FrameSampler(Sampler):
         frame = torch.randint(len(seconds), (num_rays,), device=self.device)
         pixel = usable[torch.randint(len(usable), (num_rays,), device=self.device)]
         return self.pixel_rays.rays(pixel, [seconds[frame]]), FrameBatch(values[frame, pixel] / 255)
+
+
+def _as_seen(image: Image.Image, num_channels: int, encoding: ImageEncoding) -> NDArray[np.uint8]:
+    """Return the (pixels, channels) display values of an image as the sensor sees it and the metrics compare it."""
+    if num_channels == 1 and image.mode == "L":
+        return np.asarray(image).reshape(-1, 1)
+    values = np.array(image.convert("RGB")).reshape(-1, 3)
+    if num_channels == 3:
+        return values
+    luminance = to_channels(decode(torch.from_numpy(values) / 255, encoding), 1)
+    return (255 * encode(luminance, encoding)).round().byte().numpy()
