@@ -9,6 +9,7 @@ import torch
 
 from aenerf_ns.camera.alignment import pose_errors
 from aenerf_ns.camera.trajectory import OPENCV_TO_OPENGL, Trajectory, homogeneous
+from aenerf_ns.errors import DataError
 from aenerf_ns.evaluation.run import TrainedRun
 
 # Poses are not corrected if they are turned by less than this in radians, and moved by less than this in extents of
@@ -32,7 +33,7 @@ def diagnose(run: TrainedRun) -> dict[str, Any]:
 
     Returns:
         The figures and a ``summary`` of them in words, as plain values, which JSON and checkpoints can hold. The
-        contrasts are None where there are too few events, and there are no stretches where batches are not of pairs.
+        contrasts are None where too few events can be read, and there are no stretches where batches are not of pairs.
     """
     correction, scene = run.model.camera_optimizer, run.dataset.scene
     estimated, corrected, _ = (scene.to_recording(poses) for poses in correction.compared_poses())
@@ -120,8 +121,13 @@ def _compare_contrast(run: TrainedRun) -> dict[str, Any]:
     from aenerf_ns.checking.contrast import WarpedEvents
     from aenerf_ns.checking.hypotheses import Hypothesis
 
-    correction, events = run.model.camera_optimizer, run.dataset.timeline
+    correction = run.model.camera_optimizer
     absent = {"contrast_estimated": None, "contrast_corrected": None, "contrast_is_clearly_lower": False}
+    try:
+        events = run.dataset.timeline
+    except DataError:
+        # A method that trains on images has not read the events. They must not end it before its last checkpoint.
+        return absent
     if len(events) < _MIN_EVENTS:
         return absent
     base = correction.trajectory

@@ -31,7 +31,8 @@ class TrainedRun:
         sampler: draws the batches of the run's method, from events that are read with the first batch. None of a run
             that is opened for inference.
         refine_test_poses: whether to evaluate with photometrically refined test poses too.
-        pose_diagnosis: see :func:`~aenerf_ns.evaluation.pose_diagnosis.diagnose`. None where poses are not corrected.
+        pose_diagnosis: see :func:`~aenerf_ns.evaluation.pose_diagnosis.diagnose`. None where poses are not corrected,
+            and before the last step of a training.
     """
 
     model: AENeRFModel

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from helpers.small_datasets import END, START, write_native
 from helpers.small_pipelines import make_pipeline, make_pipeline_config
 from helpers.small_trainings import train_small_model
 from nerfstudio.utils.eval_utils import eval_setup
@@ -20,6 +21,8 @@ from aenerf_ns.evaluation.pose_diagnosis import diagnose, summarize
 from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.events.stream import EventStream
 from aenerf_ns.recording.writer import NativeDatasetWriter
+from aenerf_ns.supervision.base import LossCoefficients, SamplerConfig, SupervisionConfig
+from aenerf_ns.supervision.peers.frames import FrameSampler, FrameSupervision
 from aenerf_ns.training.pipeline import AENeRFPipeline
 
 CAMERA = CameraIntrinsics(64, 48, 60.0, 60.0, 32.0, 24.0)
@@ -119,6 +122,19 @@ def test_still_camera_and_few_events_can_be_diagnosed(tmp_path: Path, mode: str)
     assert few["contrast_corrected"] is None
     for figures in (still, few):
         json.dumps(figures, allow_nan=False)
+
+
+def test_a_method_that_reads_no_events_is_diagnosed_without_them(tmp_path: Path) -> None:
+    config = make_pipeline_config(write_native(tmp_path / "data"), pose_correction="spline")
+    config.datamanager.dataparser.start_time_ns, config.datamanager.dataparser.end_time_ns = START, END
+    config.datamanager.sampler = SamplerConfig(_target=FrameSampler)
+    config.model.supervision = SupervisionConfig(_target=FrameSupervision)
+    config.model.loss_coefficients = LossCoefficients()
+    (tmp_path / "data" / "events.h5").unlink()
+    figures = diagnosed(config.setup(device="cpu", test_mode="val"))
+    assert figures["contrast_corrected"] is None
+    assert figures["stretches"] == []
+    json.dumps(figures, allow_nan=False)
 
 
 def test_last_step_is_diagnosed_and_kept_in_checkpoint(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
