@@ -21,6 +21,13 @@ def make_supervision(sensor: SensorModel, **learned: bool) -> PairSupervision:
     return supervision
 
 
+def test_events_that_cancel_up_to_rounding_have_no_temporal_loss() -> None:
+    batch = replace(make_batch(1), last_num_positive=torch.tensor([3.0]), last_num_negative=torch.tensor([2.0]))
+    outputs = {"log_radiance": torch.zeros(2, 1), "log_radiance_rate": torch.ones(1, 1)}
+    assert make_supervision(SensorModel(0.96, 1.44)).losses(outputs, batch)["temporal_loss"] == 0
+    assert make_supervision(SensorModel(0.96, 1.43)).losses(outputs, batch)["temporal_loss"] > 0
+
+
 @pytest.mark.parametrize("ratio", [1e-3, 0.5, 1.0, 1.458, 40.0])
 def test_the_ratio_starts_at_the_given_one(ratio: float) -> None:
     supervision = make_supervision(SensorModel(0.2 * ratio, 0.2), learn_contrast_threshold_ratio=True)
