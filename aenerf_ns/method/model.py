@@ -377,8 +377,6 @@ def _require_possible(config: AENeRFModelConfig, duration: float) -> None:
         raise DataError(
             "model", f"near_plane {near:g} and far_plane {far:g}", "give a finite far plane above the near one"
         )
-    if config.eval_num_rays_per_chunk < 1:
-        raise DataError("model", f"eval_num_rays_per_chunk {config.eval_num_rays_per_chunk}", "give one or more rays")
     if config.color_correction_num_rays < 1:
         raise DataError("model", f"color_correction_num_rays {config.color_correction_num_rays}", "give thousands")
     rounds, networks = len(config.proposal.num_samples_per_ray), len(config.proposal.max_resolutions)
@@ -388,6 +386,16 @@ def _require_possible(config: AENeRFModelConfig, duration: float) -> None:
             f"proposal.num_samples_per_ray has {rounds} values, proposal.max_resolutions {networks}",
             "give as many of each, at least one",
         )
+    counts = {
+        "eval_num_rays_per_chunk": config.eval_num_rays_per_chunk,
+        "field.num_samples_per_ray": config.field.num_samples_per_ray,
+        "field.num_levels": config.field.num_levels,
+        "proposal.num_samples_per_ray": min(config.proposal.num_samples_per_ray),
+        "proposal.num_levels": config.proposal.num_levels,
+    }
+    for name, count in counts.items():
+        if count < 1:
+            raise DataError("model", f"{name} {count}", "give one or more")
     if not config.camera_optimizer.knot_interval > 0:
         raise DataError("model", f"knot_interval {config.camera_optimizer.knot_interval:g}", "give seconds above 0")
     offset = config.camera_optimizer.clock_offset

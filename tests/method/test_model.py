@@ -243,6 +243,9 @@ def test_pictures_are_also_rendered_without_color_correction() -> None:
     ("options", "message"),
     [
         ({"proposal": {"num_samples_per_ray": (8, 8), "max_resolutions": (32,)}}, "2 values, .*_resolutions 1"),
+        ({"field": {"num_samples_per_ray": 0}}, "field.num_samples_per_ray 0; give one or more"),
+        ({"proposal": {"num_samples_per_ray": (0,)}}, "proposal.num_samples_per_ray 0; give one or more"),
+        ({"proposal": {"num_levels": 0}}, "proposal.num_levels 0; give one or more"),
         ({"camera_optimizer": PoseCorrectionConfig(knot_interval=0.0)}, "knot_interval 0; give seconds above 0"),
         ({"camera_optimizer": PoseCorrectionConfig(clock_offset=-20.0)}, "clock_offset -20; give seconds, fewer than"),
         ({"camera_optimizer": PoseCorrectionConfig(clock_offset=math.nan)}, "clock_offset nan; give seconds"),
