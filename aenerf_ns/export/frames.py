@@ -31,16 +31,16 @@ def export_frames(run: TrainedRun, folder: Path, times: Tensor, num_points: int)
     """Render frames and depths at (N,) times in nanoseconds, and write them with their cameras to a new folder.
 
     Depth pictures have 16 bits and hold the distance along the optical axis, in thousandths of the recording's unit,
-    0 where no surface is seen or where it is too far. At most ``num_points`` points of the scene are written. The run
-    is in evaluation mode.
+    0 where no surface is seen, where it is too far, and where the lens gives a pixel no direction. At most
+    ``num_points`` points of the scene are written. The run is in evaluation mode.
 
     Returns:
         The share of the pixels that see a surface too far away for their depth to be written.
     """
     camera = run.recording.event_camera
-    directions, _ = camera.pixel_directions()
+    directions, usable = camera.pixel_directions()
     # Factors from distances along the ray to distances along the optical axis, which looks along -z.
-    along_axis = torch.from_numpy(-directions[..., 2:])
+    along_axis = torch.from_numpy(np.where(usable[..., None], -directions[..., 2:], 0))
     poses = homogeneous(corrected_poses(run, times))
     for name in (IMAGE_FOLDER, DEPTH_FOLDER):
         (folder / name).mkdir(parents=True)

@@ -104,11 +104,13 @@ def render(run: TrainedRun, camera: CameraIntrinsics, pose: Tensor) -> dict[str,
 
 @torch.no_grad()
 def observe_points(run: TrainedRun, images: Sequence[PlacedImage], max_points: int) -> ObservedPoints:
-    """Render points on the surfaces that images see, in the recording's world, at pixels spread over the images.
+    """Render points on the surfaces that images of one lens see, in the recording's world, at pixels spread over them.
 
-    A ray that sees no surface gives no point. The run is in evaluation mode.
+    A ray that sees no surface gives no point, nor does a pixel to which the lens gives no direction. The run is in
+    evaluation mode.
     """
     to_recording = run.scene.frame.inverse()
+    usable = torch.from_numpy(images[0].camera.pixel_directions()[1])
     generator = torch.Generator().manual_seed(0)
     parts: list[tuple[NDArray, ...]] = []
     # Where there are fewer points than images, some images in between have none.
@@ -121,7 +123,8 @@ def observe_points(run: TrainedRun, images: Sequence[PlacedImage], max_points: i
             torch.zeros(count, 1, dtype=torch.long, device=run.device), coords=coordinates.to(run.device)
         )
         rgb, depth, accumulation = run.model.render_rays(rays, "rgb", "depth", "accumulation")
-        seen = (accumulation > _MIN_OPACITY)[:, 0]
+        row, column = coordinates.long().T
+        seen = (accumulation > _MIN_OPACITY)[:, 0] & usable[row, column].to(run.device)
         positions = to_recording.map_points((rays.origins + rays.directions * depth)[seen].cpu().double())
         colors = (255 * rgb[seen].clamp(0, 1)).round().byte().cpu()
         pixels = coordinates.flip(-1)[seen.cpu()].double()

@@ -11,6 +11,7 @@ import pytest
 import torch
 from helpers.dataset_faults import set_in
 from helpers.small_pipelines import make_pipeline, make_pipeline_config
+from PIL import Image
 
 from aenerf_ns.camera.intrinsics import CameraIntrinsics
 from aenerf_ns.camera.time_window import TimeWindow
@@ -101,6 +102,22 @@ def test_depths_too_far_to_be_written_are_counted(
     # As of poses in millimeters.
     monkeypatch.setattr(frames, "render", lambda *view: {**(out := rendered(*view)), "depth": 1e3 + 0 * out["depth"]})
     assert frames.export_frames(run, tmp_path / "frames", torch.tensor([SECOND // 4]), 10) == 1.0
+
+
+def test_pixels_without_a_direction_have_no_depth_and_no_points(run: TrainedRun, tmp_path: Path) -> None:
+    run.model.field.average_init_density = 1e3
+    # The lens folds over halfway to the corners.
+    lens = CameraIntrinsics(40, 30, 20.0, 20.0, 20.0, 15.0, "radial_tangential", (-0.4, 0.0, 0.0, 0.0, 0.0))
+    _, usable = lens.pixel_directions()
+    frames.export_frames(
+        replace(run, recording=replace(run.recording, event_camera=lens)), tmp_path, torch.tensor([0]), 1
+    )
+    depth = np.asarray(Image.open(tmp_path / "depth" / "000000.png"))
+    assert (depth[usable] > 0).any()
+    assert (depth[~usable] == 0).all()
+    column, row = observe_points(run, [PlacedImage("0.png", lens, np.eye(4))], 200).pixels.astype(int).T
+    assert len(row) > 20
+    assert usable[row, column].all()
 
 
 def test_refuse_a_recording_without_images(tmp_path: Path) -> None:
