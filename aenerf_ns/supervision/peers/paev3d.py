@@ -222,7 +222,7 @@ class FlowPatchSampler(WindowSampler):
         size = int(_FLOW_DENSITY * height * width)
         begin = int(max(min(at - (at - first) % size, last - size), first))
         # Where the poses between two gaps have no events, the next ones' first stretch begins at the same index.
-        stretch = begin, int(min(begin + size, last))
+        stretch = begin, min(begin + size, int(last))
         if stretch not in self._flows:
             self._flows[stretch] = optical_flow(windows.events(slice(*stretch)))
         return self._flows[stretch]
