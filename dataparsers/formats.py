@@ -63,7 +63,8 @@ def recognize(data: Path) -> str:
 
 
 def _format_of(data: Path) -> str | None:
-    return next((name for name, config in FORMATS.items() if config.recognizes(data)), None)
+    # Some formats are told by the names of the folders above.
+    return next((name for name, config in FORMATS.items() if config.recognizes(data.absolute())), None)
 
 
 @dataclass

@@ -113,7 +113,7 @@ def test_poses_run_no_code(tmp_path: Path) -> None:
     assert not (tmp_path / "harm").exists()
 
 
-def test_choose_one_of_several_scenes(tmp_path: Path) -> None:
+def test_choose_one_of_several_scenes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     truth = write_paev3d(tmp_path / "made")
     for part in ("H5_Files", "Render_info"):
         shutil.copytree(truth.data / part / "Bunny", truth.data / part / "Car")
@@ -122,6 +122,10 @@ def test_choose_one_of_several_scenes(tmp_path: Path) -> None:
     one = truth.data / "H5_Files" / "Car"
     assert recognize(one) == "paev3d-data"
     assert recording_of(PAEv3DDataParserConfig(data=one)).event_file.path.parent == one
+    monkeypatch.chdir(one)
+    assert recognize(Path()) == "paev3d-data"
+    with pytest.raises(DataError, match=r"event.h5: it belongs to a recording in the format paev3d-data"):
+        recognize(Path("event.h5"))
 
 
 def test_robust_enerf_states_its_sensor_and_views(tmp_path: Path) -> None:
