@@ -90,7 +90,8 @@ class EventDataParser(DataParser):
             DataError: a file is missing or its content cannot be used.
         """
         with reading(self.data):
-            if self._lacks_poses():
+            # Given poses without true ones are an error, not a recording without poses.
+            if self._lacks_poses() and getattr(self.config, "trajectory", None) is None:
                 capture, frames = self.read_capture()
                 if capture.has_own_frames:
                     require_distinct_times([time for time, _ in frames], self.data)

@@ -86,8 +86,9 @@ def test_ecd_text_may_be_given_other_poses(tmp_path: Path) -> None:
     taken = views.metadata[REFERENCE_SECONDS][0, 0].item()
     assert taken == pytest.approx(0.15 - 1e-9 * scene.trajectory.start)
     (folder / "groundtruth.txt").unlink()
-    with pytest.raises(DataError, match="there are no such poses, which --trajectory needs as the true ones; give"):
-        parse(config)
+    for read in (parse, lambda config: config.setup().read_frames()):
+        with pytest.raises(DataError, match="there are no such poses, which --trajectory needs as the true ones; give"):
+            read(config)
 
 
 def test_read_the_real_recording(slider_depth: Path) -> None:
