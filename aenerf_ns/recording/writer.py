@@ -124,7 +124,7 @@ class NativeDatasetWriter(_FolderWriter):
         super().__init__(folder, sensor)
         self._camera = event_camera
         frame_camera = event_camera if frame_camera is None else frame_camera
-        self._names: dict[Path, str] = {}
+        self._names: dict[tuple[Path, int | None], str] = {}
         self._meta: dict[str, Any] = {
             "w": frame_camera.width,
             "h": frame_camera.height,
@@ -215,18 +215,18 @@ class NativeDatasetWriter(_FolderWriter):
         time: int | None = None,
         background: tuple[float, float, float] | None = None,
     ) -> None:
-        """Add a reference image by copying its file. A file that is added to several splits is copied once.
+        """Add a reference image by copying its file, once for several splits and anew for another time.
 
         ``background``, RGB in [0, 1] in the image's encoding, is composed with an image that has an alpha channel,
         because the dataset format has none. The other arguments are those of :meth:`add_image`.
         """
-        if file in self._names:
-            self._meta[f"{split}_filenames"].append(self._names[file])
+        if (file, time) in self._names:
+            self._meta[f"{split}_filenames"].append(self._names[file, time])
             return
         with Image.open(file) as image:
             values = None if background is None or image.mode != "RGBA" else np.asarray(image, np.float64) / 255
         name = self._add_frame(split, file.suffix if values is None else ".png", camera_to_world, time)["file_path"]
-        self._names[file] = name
+        self._names[file, time] = name
         if values is None:
             shutil.copyfile(file, self._partial / name)
             return

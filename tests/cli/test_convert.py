@@ -89,6 +89,12 @@ def test_text_files_convert(tmp_path: Path) -> None:
     assert not list(tmp_path.glob(".*"))
 
 
+def test_a_file_at_two_times_is_two_images(tmp_path: Path) -> None:
+    data = write_ecd(tmp_path / "made")
+    (data / "images.txt").write_text("0.05 images/0.png\n0.15 images/0.png\n")
+    assert_same(EcdDataParserConfig(data=data).setup().read_recording(), convert(data, tmp_path / "converted"))
+
+
 def test_frame_camera_and_images_are_carried_over(tmp_path: Path) -> None:
     data = write_native(tmp_path / "made")
     meta = json.loads((data / "transforms.json").read_text())
