@@ -97,7 +97,7 @@ def find_hot_pixels(counts: NDArray[np.integer], bayer_pattern: str | None = Non
     """
     step = 2 if bayer_pattern else 1
     around = np.zeros(counts.shape)
-    for row, column in product(range(step), repeat=2):
+    for row, column in product(*(range(min(step, side)) for side in counts.shape)):
         around[row::step, column::step] = _median_around(counts[row::step, column::step])
     excess = 2 * (np.sqrt(counts + 0.375) - np.sqrt(around + 0.375))
     spread = max(1.4826 * float(np.median(np.abs(excess))), 1.0)

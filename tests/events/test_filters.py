@@ -126,6 +126,10 @@ def test_a_filter_that_alone_sees_light_is_not_hot(share: float) -> None:
     assert np.argwhere(find_hot_pixels(counts, "RGGB")).tolist() == [[30, 20]]
 
 
+def test_a_strip_of_a_color_sensor_lacks_filters() -> None:
+    assert not find_hot_pixels(np.ones((1, 9), np.int64), "RGGB").any()
+
+
 def test_hot_pixels_are_left_out_and_told() -> None:
     rng = np.random.default_rng(0)
     rows = [(int(x), int(y), 2 * i, 1) for i, (x, y) in enumerate(rng.integers(0, (WIDTH, HEIGHT), (300, 2)))]
