@@ -24,7 +24,7 @@ _EQUAL_POSES, _MAX_STILL_SHARE = 1e-12, 0.05
 _JUMP_FACTOR = 5
 
 
-def check_poses(result: CheckResult, recording: Recording, window: TimeWindow, num_covered: int) -> None:
+def check_poses(result: CheckResult, recording: Recording, window: TimeWindow, num_posed: int) -> None:
     """Describe the poses, and look for events without one and for gaps."""
     statistics, figures, problems = result.statistics, result.figures, result.problems
     trajectory = recording.trajectory
@@ -45,7 +45,7 @@ def check_poses(result: CheckResult, recording: Recording, window: TimeWindow, n
         figures.append(f"The intrinsics were estimated with the poses: {recording.event_camera.summary()}")
     if recording.ground_truth is not None:
         figures.append(f"True poses: {len(recording.ground_truth)}, for evaluation")
-    covered = num_covered / statistics.num_events
+    covered = num_posed / statistics.num_events
     figures.append(f"Events with a pose: {covered:.1%}")
     if covered < _MIN_COVERED_SHARE:
         problems.append(

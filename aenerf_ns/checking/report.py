@@ -40,11 +40,11 @@ def check(
         DataError: the events cannot be read.
     """
     window = window or TimeWindow()
-    result, num_covered = _check_events(recording, frames, window)
+    result, num_posed, num_covered = _check_events(recording, frames, window)
     if not isinstance(recording, Recording):
         check_lens(result, recording.event_camera)
         return result
-    check_poses(result, recording, window, num_covered)
+    check_poses(result, recording, window, num_posed)
     num_problems = len(result.problems)
     check_lens(result, recording.event_camera)
     check_steps(result, recording.trajectory, window)
@@ -67,15 +67,19 @@ def check(
     return result
 
 
-def _check_events(capture: Capture, frames: Iterable[tuple[int, Path]], window: TimeWindow) -> tuple[CheckResult, int]:
-    """Check the events, and count those in the window."""
-    file, num_covered = capture.event_file, 0
+def _check_events(
+    capture: Capture, frames: Iterable[tuple[int, Path]], window: TimeWindow
+) -> tuple[CheckResult, int, int]:
+    """Check the events, and count those that have a pose, and those of them in the window, which may be chosen."""
+    file, num_posed, num_covered = capture.event_file, 0, 0
+    known = capture.trajectory.known_time(capture.max_pose_gap) if isinstance(capture, Recording) else window
     changes = FrameChanges(capture, frames, window)
     balance, noise = PolarityBalance(file, capture.sensor.refractory_period), NoiseRate(file.width, file.height)
 
     def chunks() -> Iterator[EventStream]:
-        nonlocal num_covered
+        nonlocal num_posed, num_covered
         for chunk in file.tracked("Reading events"):
+            num_posed += int(known.contains(chunk.t).sum())
             num_covered += int(window.contains(chunk.t).sum())
             changes.add(chunk, balance.add(chunk))
             noise.add(chunk)
@@ -86,7 +90,7 @@ def _check_events(capture: Capture, frames: Iterable[tuple[int, Path]], window: 
     correlation = changes.correlation()
     check_polarity(result, correlation)
     check_thresholds(result, capture, changes, balance, correlation or 0.0)
-    return result, num_covered
+    return result, num_posed, num_covered
 
 
 def _read_runs(recording: Recording, window: TimeWindow, num_covered: int) -> list[EventStream]:

@@ -286,6 +286,15 @@ def test_a_gap_between_joined_recordings_is_a_problem(tmp_path: Path) -> None:
     assert "gaps between poses" not in run(tmp_path)[1]
 
 
+def test_a_chosen_time_window_is_no_lack_of_poses(tmp_path: Path) -> None:
+    np.savez(tmp_path / "events.npz", **random_events(10.0, 0.0, 1000))
+    write_calibration(tmp_path / "calibration.json")
+    write_poses(tmp_path / "trajectory.txt", seconds=10.0)
+    output = run(tmp_path, format_options=("start-time-ns=2000000000", "end-time-ns=4000000000"))[1]
+    assert "Events with a pose: 100.0%" in output
+    assert "the others are not used" not in output
+
+
 def test_few_events_are_not_warped(tmp_path: Path) -> None:
     picture = tmp_path / "warped.png"
     _, output = run(write_native(tmp_path / "few"), picture=picture)
