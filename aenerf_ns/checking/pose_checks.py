@@ -62,7 +62,9 @@ def check_poses(result: CheckResult, recording: Recording, window: TimeWindow, n
         shares = all_shares[gaps]
         time_shares = np.diff(times.clip(window.start, window.end))[gaps] / (window.end - window.start)
         # Poses of images of events are further apart where the camera is slow, with as many events in between.
-        share = shares[shares > _GAP_FACTOR * np.median(all_shares)].sum()
+        is_busy = shares > _GAP_FACTOR * np.median(all_shares)
+        # A window that was chosen may leave gaps out.
+        share = shares[is_busy & (times[gaps] < window.end) & (times[gaps + 1] > window.start)].sum()
         # Pairs of events span what lies between two recordings that were joined. A slow camera has some events, and a
         # camera that rests goes on from where it was.
         has_moved = ((steps > _JUMP_FACTOR * steps.median()) | (degrees > _JUMP_FACTOR * degrees.median())).numpy()
@@ -86,8 +88,9 @@ def check_steps(result: CheckResult, trajectory: Trajectory, window: TimeWindow)
     """Look for poses that stand still while there are events, or jump."""
     times, poses = trajectory.times.numpy(), trajectory.camera_to_worlds
     still = np.flatnonzero(((poses[1:] - poses[:-1]).abs().flatten(1).amax(1) < _EQUAL_POSES).numpy())
-    segment = np.searchsorted(times, result.statistics.pair_times[:, 1]) - 1
-    share = float(np.isin(segment, still).mean()) if len(segment) else 0.0
+    later = result.statistics.pair_times[:, 1]
+    is_still = np.isin(np.searchsorted(times, later) - 1, still) & (later >= window.start) & (later <= window.end)
+    share = float(is_still.mean()) if len(later) else 0.0
     if share > _MAX_STILL_SHARE:
         result.problems.append(
             f"{share:.1%} of the events fall between poses that are equal (the first at {times[still[0]]} ns): "

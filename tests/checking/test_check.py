@@ -290,9 +290,18 @@ def test_a_chosen_time_window_is_no_lack_of_poses(tmp_path: Path) -> None:
     np.savez(tmp_path / "events.npz", **random_events(10.0, 0.0, 1000))
     write_calibration(tmp_path / "calibration.json")
     write_poses(tmp_path / "trajectory.txt", seconds=10.0)
-    output = run(tmp_path, format_options=("start-time-ns=2000000000", "end-time-ns=4000000000"))[1]
+    window = "start-time-ns=2000000000", "end-time-ns=4000000000"
+    output = run(tmp_path, format_options=window)[1]
     assert "Events with a pose: 100.0%" in output
     assert "the others are not used" not in output
+    # Nor is what is wrong with the poses of other times a problem.
+    lines = (tmp_path / "trajectory.txt").read_text().splitlines(keepends=True)
+    still = [f"{line.split()[0]} 6 0 0 0 0 0 1\n" for line in lines[600:800]]
+    (tmp_path / "trajectory.txt").write_text("".join(lines[:50] + lines[150:600] + still + lines[800:]))
+    problems = "of the events fall in gaps", "of the events fall between poses that are equal"
+    for options in ((), window):
+        output = run(tmp_path, format_options=options)[1]
+        assert [problem in output for problem in problems] == [not options] * 2
 
 
 def test_few_events_are_not_warped(tmp_path: Path) -> None:
