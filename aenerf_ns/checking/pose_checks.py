@@ -89,8 +89,8 @@ def check_steps(result: CheckResult, trajectory: Trajectory, window: TimeWindow)
     times, poses = trajectory.times.numpy(), trajectory.camera_to_worlds
     still = np.flatnonzero(((poses[1:] - poses[:-1]).abs().flatten(1).amax(1) < _EQUAL_POSES).numpy())
     later = result.statistics.pair_times[:, 1]
-    is_still = np.isin(np.searchsorted(times, later) - 1, still) & (later >= window.start) & (later <= window.end)
-    share = float(is_still.mean()) if len(later) else 0.0
+    later = later[window.contains(later)]
+    share = float(np.isin(np.searchsorted(times, later) - 1, still).mean()) if len(later) else 0.0
     if share > _MAX_STILL_SHARE:
         result.problems.append(
             f"{share:.1%} of the events fall between poses that are equal (the first at {times[still[0]]} ns): "
