@@ -235,8 +235,6 @@ class PairSupervision(ChangeSupervision):
             rate = outputs["log_radiance_rate"].gather(1, batch.channel[:, None])[:, 0]
             interval = batch.last_interval + outputs.get("interval_change", 0.0)
             last_change = batch.last_num_positive * positive - batch.last_num_negative * negative
-            # What cancels in decimals leaves a rest in float32, which the loss would divide by.
-            last_change = last_change * (last_change.abs() > 1e-3 * unit)
             losses["temporal_loss"] = temporal_loss(rate, last_change, interval)
         return losses
 
