@@ -92,10 +92,6 @@ class FrameSampler(Sampler):
 
 def _as_seen(image: Image.Image, num_channels: int, encoding: ImageEncoding) -> NDArray[np.uint8]:
     """Return the (pixels, channels) display values of an image as the sensor sees it and the metrics compare it."""
-    if num_channels == 1 and image.mode == "L":
-        return np.asarray(image).reshape(-1, 1)
-    values = np.array(image.convert("RGB")).reshape(-1, 3)
-    if num_channels == 3:
-        return values
-    luminance = to_channels(decode(torch.from_numpy(values) / 255, encoding), 1)
-    return (255 * encode(luminance, encoding)).round().byte().numpy()
+    display = torch.from_numpy(np.array(image.convert("RGB")).reshape(-1, 3)) / 255
+    seen = to_channels(decode(display, encoding), num_channels)
+    return (255 * encode(seen, encoding)).round().byte().numpy()
