@@ -20,7 +20,7 @@ def temporal_loss(rate: Tensor, change: Tensor, interval: Tensor) -> Tensor:
     Returns:
         The loss, a scalar: 1 for a constant field.
     """
-    # What cancels in decimals leaves a rest in float32.
+    # Events that cancel may leave a rounding error in place of zero. It is far smaller than a contrast threshold.
     usable = change.abs() > 1e-5
     relative = 1 - rate * interval / torch.where(usable, change, 1)
     return (relative.abs() * usable).sum() / usable.sum().clamp_min(1)
