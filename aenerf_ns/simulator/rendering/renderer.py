@@ -29,6 +29,20 @@ POINT_SPREAD = 0.5
 """Standard deviation of a pixel's Gaussian point-spread function, in pixels."""
 
 
+@numba.njit(cache=True, nogil=True)
+def _aim(pose, fx, fy, cx, cy, offsets, rays, begin, end):
+    """Fill rows of ``rays`` (H, W, samples, 6), whose directions are one meter long along the optical axis."""
+    _, width, samples, _ = rays.shape
+    for row in range(begin, end):
+        for column in range(width):
+            for n in range(samples):
+                x = (column + 0.5 + offsets[n, 0] - cx) / fx
+                y = (row + 0.5 + offsets[n, 1] - cy) / fy
+                for axis in range(3):
+                    rays[row, column, n, axis] = pose[axis, 3]
+                    rays[row, column, n, 3 + axis] = x * pose[axis, 0] + y * pose[axis, 1] + pose[axis, 2]
+
+
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _shade(surface, light, rays, hits, focal, background, sky, limit, radiance, depth, begin, end):
     """Shade rows of the hits of camera rays and fill ``radiance`` and ``depth``.
@@ -108,13 +122,8 @@ class Renderer:
             where none does. Both are float32.
         """
         pose, (fx, fy, cx, cy) = np.asarray(camera_to_world, np.float64), map(float, intrinsics)
-        offsets = sample_offsets(samples)
-        x = (np.arange(width)[None, :, None] + 0.5 + offsets[:, 0] - cx) / fx
-        y = (np.arange(height)[:, None, None] + 0.5 + offsets[:, 1] - cy) / fy
         rays = np.empty((height, width, samples, 6), np.float32)
-        rays[..., :3] = pose[:3, 3]
-        # One meter long along the optical axis.
-        rays[..., 3:] = x[..., None] * pose[:3, 0] + y[..., None] * pose[:3, 1] + pose[:3, 2]
+        run_ranges(partial(_aim, pose, fx, fy, cx, cy, sample_offsets(samples), rays), height)
         rays = rays.reshape(-1, 6)
         hits = self.caster.cast(rays)
         radiance, depth = np.empty((height, width, 3), np.float32), np.empty((height, width), np.float32)
