@@ -31,7 +31,7 @@ _NOISE = {
     "medium": _FULL_SIZE_NOISE,
     "tiny": ("--pose-noise-degrees", "1.5", "--pose-noise-translation", "0.04"),
 }
-_STEPS = {"full": 30000, "medium": 8000, "tiny": 1500}
+_STEPS = {"full": 30000, "medium": 4000, "tiny": 1500}
 # A CPU renders 100 views of this size in four minutes, so a run of medium scale has no curve over the training.
 _MEDIUM_TRAIN = ("--steps-per-eval-all-images", "0")
 # Pairs of a batch in the table of losses. They are as many as the methods' own batches hold, at two rays a pair.
@@ -180,7 +180,7 @@ class Plan:
     seeds: tuple[int, ...] = (42,)
     """Seeds of the trainings."""
     steps: int | None = None
-    """Steps of every training. By default 30,000 at full scale, 8000 at medium and 1500 at tiny scale."""
+    """Steps of every training. By default 30,000 at full scale, 4000 at medium and 1500 at tiny scale."""
     simulate: str = ""
     """More options of aenerf simulate, as in --simulate="--bayer-pattern RGGB"."""
     train: str = ""
