@@ -56,8 +56,7 @@ def _make_config() -> AENeRFTrainerConfig:
 
 
 aenerf_mlp = MethodSpecification(
-    config=_make_config(),
-    description="AE-NeRF by the paper's recipe, on its MLPs: slow, for a GPU.",
+    config=_make_config(), description="AE-NeRF by the paper's recipe, on its MLPs: slow, for a GPU."
 )
 
 
@@ -77,6 +76,5 @@ def _make_small_config() -> AENeRFTrainerConfig:
 
 
 aenerf_mlp_small = MethodSpecification(
-    config=_make_small_config(),
-    description="AE-NeRF by the paper's recipe, on narrow MLPs: for a CPU.",
+    config=_make_small_config(), description="AE-NeRF by the paper's recipe, on narrow MLPs: for a CPU."
 )

@@ -64,12 +64,7 @@ def describe_run(method: str, scene: str, num_steps: int) -> dict[str, Any]:
     return {
         "method": method,
         "num_iterations": num_steps,
-        "dataset_metadata": {
-            "id": _DATASET,
-            "scene": scene,
-            "evaluation_protocol": _PROTOCOL,
-            "color_space": "srgb",
-        },
+        "dataset_metadata": {"id": _DATASET, "scene": scene, "evaluation_protocol": _PROTOCOL, "color_space": "srgb"},
         "evaluation_protocol": _PROTOCOL,
     }
 
