@@ -85,6 +85,22 @@ def small_work() -> Iterator[None]:
 
 
 @pytest.fixture
+def native(tmp_path: Path) -> Path:
+    """A small dataset in the native format, without a scene box."""
+    from helpers.small_datasets import write_native
+
+    return write_native(tmp_path / "made")
+
+
+@pytest.fixture
+def ecd(tmp_path: Path) -> Path:
+    """A small dataset in the Event Camera Dataset's format."""
+    from helpers.small_datasets import write_ecd
+
+    return write_ecd(tmp_path / "made")
+
+
+@pytest.fixture
 def box_file(tmp_path: Path) -> Path:
     """A mesh file with a textured box of 1.2 x 0.8 x 0.6 m."""
     from helpers.small_meshes import painted_box

@@ -16,7 +16,6 @@ import torch
 from helpers.commands import simulate
 from helpers.dataset_faults import edit_json, set_in
 from helpers.own_recordings import random_events, write_calibration, write_poses
-from helpers.small_datasets import write_native
 from nerfstudio.utils.rich_utils import CONSOLE
 from PIL import Image
 
@@ -304,9 +303,9 @@ def test_a_chosen_time_window_is_no_lack_of_poses(tmp_path: Path) -> None:
         assert [problem in output for problem in problems] == [not options] * 2
 
 
-def test_few_events_are_not_warped(tmp_path: Path) -> None:
+def test_few_events_are_not_warped(native: Path, tmp_path: Path) -> None:
     picture = tmp_path / "warped.png"
-    _, output = run(write_native(tmp_path / "few"), picture=picture)
+    _, output = run(native, picture=picture)
     assert "Contrast of warped events: not computed, because no 2000 events have poses without" in output
     assert f"{picture}: not written" in output
     assert not picture.exists()

@@ -74,50 +74,47 @@ def test_native_dataset_converts_to_itself(box: np.ndarray | None, tmp_path: Pat
         np.testing.assert_array_equal(after.scene_box.numpy(), box)
 
 
-def test_text_files_convert(tmp_path: Path) -> None:
-    data = write_ecd(tmp_path / "made")
+def test_text_files_convert(ecd: Path, tmp_path: Path) -> None:
     given = tmp_path / "other.txt"
-    write_tum_trajectory(given, perturb(read_tum_trajectory(data / "groundtruth.txt"), 2.0, 0.1, 0.1, 0))
+    write_tum_trajectory(given, perturb(read_tum_trajectory(ecd / "groundtruth.txt"), 2.0, 0.1, 0.1, 0))
     for name, options in (("plain", ()), ("other", (f"trajectory={given}",))):
         with CONSOLE.capture() as output:
-            after = convert(data, tmp_path / name, format="ecd-data", format_options=options)
+            after = convert(ecd, tmp_path / name, format="ecd-data", format_options=options)
         assert "4 of 4 events, 5 poses, images: 4 train, 2 val, 2 test." in output.get()
-        config = EcdDataParserConfig(data=data, trajectory=given if options else None)
+        config = EcdDataParserConfig(data=ecd, trajectory=given if options else None)
         assert_same(config.setup().read_recording(), after)
         # An image of several splits is written once.
         assert len(list((tmp_path / name / "images").rglob("*.png"))) == 4
     assert not list(tmp_path.glob(".*"))
 
 
-def test_a_file_at_two_times_is_two_images(tmp_path: Path) -> None:
-    data = write_ecd(tmp_path / "made")
-    (data / "images.txt").write_text("0.05 images/0.png\n0.15 images/0.png\n")
-    assert_same(EcdDataParserConfig(data=data).setup().read_recording(), convert(data, tmp_path / "converted"))
+def test_a_file_at_two_times_is_two_images(ecd: Path, tmp_path: Path) -> None:
+    (ecd / "images.txt").write_text("0.05 images/0.png\n0.15 images/0.png\n")
+    assert_same(EcdDataParserConfig(data=ecd).setup().read_recording(), convert(ecd, tmp_path / "converted"))
 
 
-def test_frame_camera_and_images_are_carried_over(tmp_path: Path) -> None:
-    data = write_native(tmp_path / "made")
-    meta = json.loads((data / "transforms.json").read_text())
+def test_frame_camera_and_images_are_carried_over(native: Path, tmp_path: Path) -> None:
+    meta = json.loads((native / "transforms.json").read_text())
     meta.update(w=8, h=5, fl_x=9.0, fl_y=9.5, cx=4.1, cy=2.4, camera_model="OPENCV_FISHEYE", k1=0.1, k4=-0.2)
     # Other programs' names that say nothing else.
     meta.update(is_fisheye=True, fisheye_crop_radius=3, undistorted=True)
     for key in ("k2", "k3", "p1", "p2"):
         meta.pop(key)
     for index, frame in enumerate(meta["frames"]):
-        (data / frame["file_path"]).unlink()
+        (native / frame["file_path"]).unlink()
         old, new = frame["file_path"], f"images/{index}.jpg"
-        Image.fromarray(np.full((5, 8), 30 * index, np.uint8)).save(data / new)
+        Image.fromarray(np.full((5, 8), 30 * index, np.uint8)).save(native / new)
         for split in ("train", "val", "test"):
             meta[f"{split}_filenames"] = [new if name == old else name for name in meta[f"{split}_filenames"]]
         frame["file_path"] = new
-    (data / "transforms.json").write_text(json.dumps(meta))
-    before = NativeDataParserConfig(data=data).setup().read_recording()
+    (native / "transforms.json").write_text(json.dumps(meta))
+    before = NativeDataParserConfig(data=native).setup().read_recording()
     assert before.frame_camera.lens_model == "fisheye"
-    assert_same(before, convert(data, tmp_path / "converted"))
+    assert_same(before, convert(native, tmp_path / "converted"))
 
 
-def test_alpha_is_composed_with_the_background(tmp_path: Path) -> None:
-    recording = NativeDataParserConfig(data=write_native(tmp_path / "made")).setup().read_recording()
+def test_alpha_is_composed_with_the_background(native: Path, tmp_path: Path) -> None:
+    recording = NativeDataParserConfig(data=native).setup().read_recording()
     pixels = np.zeros((4, 6, 4), np.uint8)
     pixels[:, 3:] = (255, 0, 0, 255)
     pixels[0, 0] = (0, 0, 0, 51)
@@ -136,13 +133,11 @@ def test_alpha_is_composed_with_the_background(tmp_path: Path) -> None:
     assert written[0, 0].tolist() == [204, 102, 204]
 
 
-def test_filters_cut_everything(tmp_path: Path) -> None:
-    data = write_native(tmp_path / "made")
-    before = NativeDataParserConfig(data=data).setup().read_recording()
+def test_filters_cut_everything(native: Path, tmp_path: Path) -> None:
+    before = NativeDataParserConfig(data=native).setup().read_recording()
     start, end = START + 100_000_000, START + 1_450_000_000
-    after = convert(
-        data, tmp_path / "converted", start_time_ns=start, end_time_ns=end, region=(2, 0, 3, 2), pixel_share=0.5, seed=3
-    )
+    options = {"start_time_ns": start, "end_time_ns": end, "region": (2, 0, 3, 2), "pixel_share": 0.5, "seed": 3}
+    after = convert(native, tmp_path / "converted", **options)
     events = read(before.event_file)
     x, y, t, _ = events.T
     inside = (t >= start) & (t <= end) & (x >= 2) & (x < 5) & (y < 2)
@@ -173,30 +168,28 @@ def test_images_outside_the_events_take_no_places(tmp_path: Path) -> None:
         assert [len(after.reference_views[split]) for split in ("val", "test")] == [1, 1]
 
 
-def test_hot_pixels_are_named(tmp_path: Path) -> None:
-    data = write_native(tmp_path / "made")
+def test_hot_pixels_are_named(native: Path, tmp_path: Path) -> None:
     events = random_stream(3000, 6, 4, END, start=START, seed=1)
     events.x[::2], events.y[::2] = 3, 1
-    with Hdf5EventWriter(data / "events.h5") as writer:
+    with Hdf5EventWriter(native / "events.h5") as writer:
         writer.append(events)
     with CONSOLE.capture() as output:
-        after = convert(data, tmp_path / "converted", drop_hot_pixels=True)
+        after = convert(native, tmp_path / "converted", drop_hot_pixels=True)
     assert "Hot pixels: 1, with 5" in output.get()
     assert "(3, 1) 1,5" in output.get()
     hot = (events.x == 3) & (events.y == 1)
     np.testing.assert_array_equal(read(after.event_file)[:, 2], events.t[~hot])
 
 
-def test_poses_from_frames_replace_the_given_ones(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_poses_from_frames_replace_the_given_ones(ecd: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     place_frames(3, monkeypatch)
-    data = write_ecd(tmp_path / "made")
     with CONSOLE.capture() as output:
-        with_truth = convert(data, tmp_path / "with_truth", poses="colmap")
+        with_truth = convert(ecd, tmp_path / "with_truth", poses="colmap")
     assert "z is up if the camera was held level, and the scale is arbitrary" in " ".join(output.get().split())
     assert "3 of 4 frames registered" in output.get()
     times = [50_000_000, 150_000_000, 250_000_000]
     assert with_truth.trajectory.times.tolist() == times
-    truth = read_tum_trajectory(data / "groundtruth.txt")
+    truth = read_tum_trajectory(ecd / "groundtruth.txt")
     assert with_truth.ground_truth is not None
     torch.testing.assert_close(with_truth.ground_truth.camera_to_worlds, truth.camera_to_worlds)
     report = json.loads((tmp_path / "with_truth" / "poses_report.json").read_text())
@@ -206,14 +199,14 @@ def test_poses_from_frames_replace_the_given_ones(tmp_path: Path, monkeypatch: p
     np.testing.assert_array_equal(with_truth.scene_box, FOUND_BOX)
     # All images are kept, with the true poses.
     assert [len(with_truth.reference_views[split]) for split in ("train", "val", "test")] == [4, 2, 2]
-    (data / "groundtruth.txt").unlink()
-    without = convert(data, tmp_path / "without", poses="colmap", format="ecd-data")
+    (ecd / "groundtruth.txt").unlink()
+    without = convert(ecd, tmp_path / "without", poses="colmap", format="ecd-data")
     assert without.ground_truth is None
     assert without.trajectory.times.tolist() == times
     assert [len(without.reference_views[split]) for split in ("train", "val", "test")] == [3, 2, 1]
     np.testing.assert_array_equal(read(without.event_file), read(with_truth.event_file))
     with pytest.raises(DataError, match=r"groundtruth.txt: there are no such poses"):
-        convert(data, tmp_path / "given", format="ecd-data")
+        convert(ecd, tmp_path / "given", format="ecd-data")
 
 
 def find_three_poses(monkeypatch: pytest.MonkeyPatch, first: int) -> None:
@@ -231,48 +224,45 @@ def find_three_poses(monkeypatch: pytest.MonkeyPatch, first: int) -> None:
 
 
 def test_images_of_another_camera_are_left_out_of_poses_from_events(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    native: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     find_three_poses(monkeypatch, START)
-    data = write_native(tmp_path / "made")
-    MOUNTED_APART(data)
+    MOUNTED_APART(native)
     for name in ("estimated", "ground_truth"):
-        (data / f"trajectory_{name}.txt").unlink()
+        (native / f"trajectory_{name}.txt").unlink()
     with CONSOLE.capture() as output:
-        found = convert(data, tmp_path / "found", poses="events")
+        found = convert(native, tmp_path / "found", poses="events")
     assert "The recording's images are left out: they are of another camera than the events." in output.get()
     assert not any(found.reference_views.values())
     assert found.frame_from_event is None
 
 
-def test_given_poses_of_another_time_are_left_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_given_poses_of_another_time_are_left_out(ecd: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     find_three_poses(monkeypatch, 50_000_000)
-    data = write_ecd(tmp_path / "made")
-    given = read_tum_trajectory(data / "groundtruth.txt")
-    write_tum_trajectory(data / "groundtruth.txt", Trajectory(given.times + 10**12, given.camera_to_worlds))
+    given = read_tum_trajectory(ecd / "groundtruth.txt")
+    write_tum_trajectory(ecd / "groundtruth.txt", Trajectory(given.times + 10**12, given.camera_to_worlds))
     with CONSOLE.capture() as output:
         options = {"format": "ecd-data", "format_options": ("max-pose-gap-ns=150000000",)}
-        found = convert(data, tmp_path / "found", poses="events", **options)
+        found = convert(ecd, tmp_path / "found", poses="events", **options)
     assert found.max_pose_gap == 150_000_000
     assert "The given poses, from 1000000000000 to " in output.get()
     assert "are of another time than the estimated ones, from 50000000 to 250000000 ns: they are left" in output.get()
     assert found.ground_truth is None
     assert found.trajectory.times.tolist() == [50_000_000, 150_000_000, 250_000_000]
-    assert convert(data, tmp_path / "again", poses="events", format="ecd-data").max_pose_gap == 100_000_000
+    assert convert(ecd, tmp_path / "again", poses="events", format="ecd-data").max_pose_gap == 100_000_000
 
 
 @pytest.mark.parametrize(
     ("poses", "search"), [("events", "from_events.estimate_poses_from_events"), ("refined", "from_poses.refine_poses")]
 )
 def test_broken_images_are_refused_before_poses_are_found(
-    poses: str, search: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    poses: str, search: str, ecd: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(f"aenerf_ns.pose_estimation.{search}", lambda *_: pytest.fail("it searched"))
-    data = write_ecd(tmp_path / "made")
-    for image in (data / "images").iterdir():
+    for image in (ecd / "images").iterdir():
         image.write_bytes(b"no image")
     with pytest.raises(DataError, match=r"images/\S+\.png: "):
-        convert(data, tmp_path / "converted", poses=poses)
+        convert(ecd, tmp_path / "converted", poses=poses)
 
 
 @pytest.mark.parametrize(
@@ -280,35 +270,32 @@ def test_broken_images_are_refused_before_poses_are_found(
     [(1000, 0, "as if the times of the images were in millisec"), (1, 1000, "0 of 4 frames were taken during the ev")],
 )
 def test_frames_on_another_clock_are_refused_before_poses_are_found(
-    factor: int, shift: int, message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    factor: int, shift: int, message: str, ecd: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("aenerf_ns.pose_estimation.from_frames.estimate_poses", lambda *_: pytest.fail("it searched"))
-    data = write_ecd(tmp_path / "made")
-    (data / "groundtruth.txt").unlink()
-    rows = [row.split() for row in (data / "images.txt").read_text().splitlines()]
+    (ecd / "groundtruth.txt").unlink()
+    rows = [row.split() for row in (ecd / "images.txt").read_text().splitlines()]
     moved = [f"{factor * float(time) + shift:.9f} {name}" for time, name in rows]
-    (data / "images.txt").write_text("\n".join(moved))
+    (ecd / "images.txt").write_text("\n".join(moved))
     with pytest.raises(DataError, match=message):
-        convert(data, tmp_path / "converted", poses="colmap", format="ecd-data")
+        convert(ecd, tmp_path / "converted", poses="colmap", format="ecd-data")
 
 
-def test_the_report_on_poses_stays_with_them(tmp_path: Path) -> None:
-    data = write_native(tmp_path / "made")
-    (data / "poses_report.json").write_text('{"summary": "Found by hand."}')
-    Image.new("RGB", (3, 2)).save(data / "poses_report.png")
-    convert(data, tmp_path / "once", pixel_share=0.5)
+def test_the_report_on_poses_stays_with_them(native: Path, tmp_path: Path) -> None:
+    (native / "poses_report.json").write_text('{"summary": "Found by hand."}')
+    Image.new("RGB", (3, 2)).save(native / "poses_report.png")
+    convert(native, tmp_path / "once", pixel_share=0.5)
     convert(tmp_path / "once", tmp_path / "twice")
     for name in ("poses_report.json", "poses_report.png"):
-        assert (tmp_path / "twice" / name).read_bytes() == (data / name).read_bytes()
+        assert (tmp_path / "twice" / name).read_bytes() == (native / name).read_bytes()
 
 
 @pytest.mark.parametrize("change", [OTHER_LENS, MOUNTED_APART])
-def test_frames_of_another_camera_give_no_poses(change: Change, tmp_path: Path) -> None:
-    data = write_native(tmp_path / "made")
-    change(data)
-    assert not convert(data, tmp_path / "given").has_own_frames
+def test_frames_of_another_camera_give_no_poses(change: Change, native: Path, tmp_path: Path) -> None:
+    change(native)
+    assert not convert(native, tmp_path / "given").has_own_frames
     with pytest.raises(DataError, match="frames are of another camera than its events"):
-        convert(data, tmp_path / "converted", poses="colmap")
+        convert(native, tmp_path / "converted", poses="colmap")
 
 
 @pytest.mark.parametrize(
@@ -332,20 +319,18 @@ def test_frames_of_another_camera_give_no_poses(change: Change, tmp_path: Path) 
         ({"poses": "events", "seed": 2**32}, "--seed: 4294967296 is out of range"),
     ],
 )
-def test_impossible_options_are_one_line(options: dict, message: str, tmp_path: Path) -> None:
-    data = write_native(tmp_path / "made")
+def test_impossible_options_are_one_line(options: dict, message: str, native: Path, tmp_path: Path) -> None:
     with pytest.raises(DataError, match=message):
-        convert(data, tmp_path / "converted", **options)
+        convert(native, tmp_path / "converted", **options)
     assert [path.name for path in tmp_path.iterdir()] == ["made"]
 
 
-def test_poses_are_refined_only_where_the_truth_is_of_their_time(tmp_path: Path) -> None:
-    data = write_native(tmp_path / "made")
-    truth = read_tum_trajectory(data / "trajectory_ground_truth.txt")
+def test_poses_are_refined_only_where_the_truth_is_of_their_time(native: Path, tmp_path: Path) -> None:
+    truth = read_tum_trajectory(native / "trajectory_ground_truth.txt")
     late = Trajectory(truth.times + 10**12, truth.camera_to_worlds)
-    write_tum_trajectory(data / "trajectory_ground_truth.txt", late)
+    write_tum_trajectory(native / "trajectory_ground_truth.txt", late)
     with pytest.raises(DataError, match=r"trajectory_ground_truth\.txt: .* do not cover two of the estimated"):
-        convert(data, tmp_path / "converted", poses="refined")
+        convert(native, tmp_path / "converted", poses="refined")
 
 
 def test_print_the_command_to_train_with(tmp_path: Path) -> None:
@@ -362,8 +347,7 @@ def test_print_the_command_to_train_with(tmp_path: Path) -> None:
         assert parser.config.auto_scale_poses is scale
 
 
-def test_terminated_command_leaves_no_dataset(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    data = write_native(tmp_path / "made")
+def test_terminated_command_leaves_no_dataset(native: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
     def append(*_: object) -> None:
         assert (tmp_path / ".converted.partial" / "events.h5").exists()
@@ -371,6 +355,6 @@ def test_terminated_command_leaves_no_dataset(tmp_path: Path, monkeypatch: pytes
 
     monkeypatch.setattr(Hdf5EventWriter, "append", append)
     with pytest.raises(SystemExit) as ended:
-        Convert(data, tmp_path / "converted").main()
+        Convert(native, tmp_path / "converted").main()
     assert ended.value.code == 128 + signal.SIGTERM
     assert [path.name for path in tmp_path.iterdir()] == ["made"]

@@ -91,10 +91,9 @@ def test_network_reconstructs_with_given_weights(
 
 
 @pytest.mark.parametrize("is_scaled", [False, True])
-def test_poses_keep_their_scale(is_scaled: bool, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
-    data = write_native(tmp_path / "made")
-    set_in("transforms.json", "auto_scale_poses", value=is_scaled)(data)
-    Reconstruct(data, tmp_path / "my images").main()
+def test_poses_keep_their_scale(is_scaled: bool, native: Path, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    set_in("transforms.json", "auto_scale_poses", value=is_scaled)(native)
+    Reconstruct(native, tmp_path / "my images").main()
     after = NativeDataParserConfig(data=tmp_path / "my images").setup()
     assert after.scales_poses(after.recording) is is_scaled
     assert f"ns-train e2vid-nerf --data '{tmp_path}/my images'\n" in capsys.readouterr().out

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from helpers.small_datasets import parse, write_ecd
+from helpers.small_datasets import parse
 from helpers.unpacked_pairs import unpacked
 
 from aenerf_ns.camera.metadata_keys import REFERENCE_SECONDS
@@ -20,24 +20,23 @@ from aenerf_ns.recording.dataset import EventDataset
 from aenerf_ns.recording.scene import SCENE_KEY
 
 
-def test_guessed_size_can_be_given(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    folder = write_ecd(tmp_path / "made")
-    (folder / "images.txt").unlink()
-    (folder / "events.txt").write_text("0.01 300 2 1\n0.02 300 2 0\n0.31 1 2 1\n")
-    config = EcdDataParserConfig(data=folder, width=346, height=260)
+def test_guessed_size_can_be_given(ecd: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (ecd / "images.txt").unlink()
+    (ecd / "events.txt").write_text("0.01 300 2 1\n0.02 300 2 0\n0.31 1 2 1\n")
+    config = EcdDataParserConfig(data=ecd, width=346, height=260)
     assert len(next(config.setup().recording.event_file.chunks())) == 3
     for given in ({}, {"width": 346}):
-        recording = EcdDataParserConfig(data=folder, **given).setup().recording
+        recording = EcdDataParserConfig(data=ecd, **given).setup().recording
         assert (recording.event_camera.width, recording.event_camera.height) == (given.get("width", 240), 180)
     assert "size 346 x 180 is a guess: if it is another" in capsys.readouterr().out
     with pytest.raises(DataError, match=r"line 1 has x = 300; .* check the sensor size"):
-        list(EcdDataParserConfig(data=folder).setup().recording.event_file.chunks())
+        list(EcdDataParserConfig(data=ecd).setup().recording.event_file.chunks())
     with pytest.raises(DataError, match=r"made: width must be .*, not 0; correct --width or --height"):
-        _ = EcdDataParserConfig(data=folder, width=0).setup().recording
+        _ = EcdDataParserConfig(data=ecd, width=0).setup().recording
 
 
-def test_ecd_text_reads(tmp_path: Path) -> None:
-    config = EcdDataParserConfig(data=write_ecd(tmp_path / "made"))
+def test_ecd_text_reads(ecd: Path) -> None:
+    config = EcdDataParserConfig(data=ecd)
     dataset = EventDataset(parse(config))
     camera = dataset.scene.event_camera
     # The format counts the principal point from the center of the first pixel.
@@ -52,25 +51,23 @@ def test_ecd_text_reads(tmp_path: Path) -> None:
     assert len(parse(config, "test").image_filenames) == 1
 
 
-def test_names_of_images_hold_a_blank(tmp_path: Path) -> None:
-    folder = write_ecd(tmp_path / "made")
-    config = EcdDataParserConfig(data=folder)
-    names = [name for _, name in (line.split() for line in (folder / "images.txt").read_text().splitlines())]
+def test_names_of_images_hold_a_blank(ecd: Path) -> None:
+    config = EcdDataParserConfig(data=ecd)
+    names = [name for _, name in (line.split() for line in (ecd / "images.txt").read_text().splitlines())]
     files = [f"view {k}.png" for k in range(len(names))]
     for name, file in zip(names, files, strict=True):
-        (folder / name).rename(folder / file)
+        (ecd / name).rename(ecd / file)
     lines = [f"0.{k}5,{file}  # a view" for k, file in enumerate(files)]
-    (folder / "images.txt").write_text("# t,file\n" + "\n".join(lines))
+    (ecd / "images.txt").write_text("# t,file\n" + "\n".join(lines))
     assert [path.name for _, path in config.setup().read_capture()[1]] == files
 
 
-def test_ecd_text_may_be_given_other_poses(tmp_path: Path) -> None:
-    folder = write_ecd(tmp_path / "made")
-    truth = read_tum_trajectory(folder / "groundtruth.txt")
+def test_ecd_text_may_be_given_other_poses(ecd: Path, tmp_path: Path) -> None:
+    truth = read_tum_trajectory(ecd / "groundtruth.txt")
     other = perturb(truth, rotation_degrees=2.0, translation=0.1, correlation_time=0.1, seed=0)
     write_tum_trajectory(tmp_path / "other.txt", other)
-    config = EcdDataParserConfig(data=folder, trajectory=tmp_path / "other.txt")
-    outputs, as_given = parse(config), parse(EcdDataParserConfig(data=folder))
+    config = EcdDataParserConfig(data=ecd, trajectory=tmp_path / "other.txt")
+    outputs, as_given = parse(config), parse(EcdDataParserConfig(data=ecd))
     scene = outputs.metadata[SCENE_KEY]
     assert as_given.metadata[SCENE_KEY].ground_truth is None
     # In the scene's frame, which follows from the estimated poses; images have true ones.
@@ -85,7 +82,7 @@ def test_ecd_text_may_be_given_other_poses(tmp_path: Path) -> None:
     assert views.metadata is not None
     taken = views.metadata[REFERENCE_SECONDS][0, 0].item()
     assert taken == pytest.approx(0.15 - 1e-9 * scene.trajectory.start)
-    (folder / "groundtruth.txt").unlink()
+    (ecd / "groundtruth.txt").unlink()
     for read in (parse, lambda config: config.setup().read_frames()):
         with pytest.raises(DataError, match="there are no such poses, which --trajectory needs as the true ones; give"):
             read(config)

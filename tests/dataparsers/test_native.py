@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from helpers.small_datasets import AS_RECORDED, CAMERA, SENSOR, START, make_trajectory, parse, write_native
+from helpers.small_datasets import AS_RECORDED, CAMERA, SENSOR, START, make_trajectory, parse
 from helpers.streams import make_stream
 
 from aenerf_ns.camera.trajectory import OPENCV_TO_OPENGL, homogeneous
@@ -21,9 +21,8 @@ from aenerf_ns.recording.dataset import EventDataset
 from aenerf_ns.recording.scene import SCENE_KEY
 
 
-def test_written_dataset_reads_back(tmp_path: Path) -> None:
-    folder = write_native(tmp_path / "made")
-    scene = parse(NativeDataParserConfig(data=folder, **AS_RECORDED)).metadata[SCENE_KEY]
+def test_written_dataset_reads_back(native: Path) -> None:
+    scene = parse(NativeDataParserConfig(data=native, **AS_RECORDED)).metadata[SCENE_KEY]
     assert (scene.event_camera, scene.sensor, scene.image_encoding) == (CAMERA, SENSOR, "srgb")
     assert not scene.bounded
     expected = make_trajectory()
@@ -35,16 +34,15 @@ def test_written_dataset_reads_back(tmp_path: Path) -> None:
         atol=1e-11,
     )
     for split, values in (("val", [77]), ("test", [78, 79])):
-        dataset = EventDataset(parse(NativeDataParserConfig(data=folder), split))
+        dataset = EventDataset(parse(NativeDataParserConfig(data=native), split))
         assert [int(dataset.get_numpy_image(i)[0, 0, 0]) for i in range(len(dataset))] == values
     events = list(scene.event_file.chunks())
     assert sum(map(len, events)) == scene.event_file.count() == 200
     assert scene.event_file.time_span() == (events[0].t[0], events[-1].t[-1])
 
 
-def test_frame_without_pose_gets_that_of_its_time(tmp_path: Path) -> None:
-    folder = write_native(tmp_path / "made")
-    meta = json.loads((folder / "transforms.json").read_text())
+def test_frame_without_pose_gets_that_of_its_time(native: Path) -> None:
+    meta = json.loads((native / "transforms.json").read_text())
     time = START + 150_000_000
     for frame in meta["frames"]:
         if frame["file_path"] == meta["test_filenames"][0]:
@@ -54,19 +52,18 @@ def test_frame_without_pose_gets_that_of_its_time(tmp_path: Path) -> None:
     shift[0, 3] = 0.5
     meta["event_camera"]["T_frame_event"] = shift.tolist()
     # Every digit of the time counts, beyond what a JSON writer's float holds.
-    (folder / "transforms.json").write_text(json.dumps(meta).replace('"STAMP"', format_seconds(time)))
-    pose = parse(NativeDataParserConfig(data=folder, **AS_RECORDED), "test").cameras.camera_to_worlds[0]
+    (native / "transforms.json").write_text(json.dumps(meta).replace('"STAMP"', format_seconds(time)))
+    pose = parse(NativeDataParserConfig(data=native, **AS_RECORDED), "test").cameras.camera_to_worlds[0]
     expected = homogeneous(make_trajectory().interpolate(time)) @ torch.linalg.inv(torch.from_numpy(shift))
     torch.testing.assert_close(pose, (expected @ OPENCV_TO_OPENGL)[:3].float(), rtol=0, atol=1e-6)
 
 
-def test_options_replace_values_of_the_sensor(tmp_path: Path) -> None:
-    folder = write_native(tmp_path / "made")
+def test_options_replace_values_of_the_sensor(native: Path) -> None:
     options = {"positive_contrast_threshold": 0.7, "refractory_period_ns": 0, "bandwidth_hz": 0.0}
-    scene = parse(NativeDataParserConfig(data=folder, **options)).metadata[SCENE_KEY]
+    scene = parse(NativeDataParserConfig(data=native, **options)).metadata[SCENE_KEY]
     assert scene.sensor == SensorModel(0.7, 0.2, 0, "RGGB")
     with pytest.raises(DataError, match=r"positive_contrast_threshold must be from 0.0001 to 1000, not 0; .*options"):
-        parse(NativeDataParserConfig(data=folder, positive_contrast_threshold=0.0))
+        parse(NativeDataParserConfig(data=native, positive_contrast_threshold=0.0))
 
 
 def test_refuse_to_write_events_out_of_order(tmp_path: Path) -> None:

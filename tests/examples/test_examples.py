@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 from helpers.examples import EXAMPLES, run_example
-from helpers.small_datasets import make_trajectory, parse, write_native
+from helpers.small_datasets import make_trajectory, parse
 from helpers.small_trainings import own_log
 
 from aenerf_ns.camera.trajectory import homogeneous
@@ -43,15 +43,14 @@ def test_written_datasets_are_read(
     assert val.time == 1_600_000_000_500_000_001
 
 
-def test_smallest_transforms(tmp_path: Path) -> None:
-    folder = write_native(tmp_path / "made")
-    camera = json.loads((folder / "transforms.json").read_text())["event_camera"]
+def test_smallest_transforms(native: Path) -> None:
+    camera = json.loads((native / "transforms.json").read_text())["event_camera"]
     required = (
         "file", "width", "height", "fl_x", "fl_y", "cx", "cy", "positive_contrast_threshold",
         "negative_contrast_threshold",
     )  # fmt: skip
-    (folder / "transforms.json").write_text(json.dumps({"event_camera": {name: camera[name] for name in required}}))
-    assert len(EventDataset(parse(NativeDataParserConfig(data=folder))).pairs)
+    (native / "transforms.json").write_text(json.dumps({"event_camera": {name: camera[name] for name in required}}))
+    assert len(EventDataset(parse(NativeDataParserConfig(data=native))).pairs)
 
 
 def test_format_of_your_own(tmp_path: Path) -> None:
@@ -71,8 +70,8 @@ def test_format_of_your_own(tmp_path: Path) -> None:
     assert dataset.scene.window.end == int(t[-1]) * 1_000
 
 
-def test_way_back_to_the_world(tmp_path: Path) -> None:
-    outputs = parse(NativeDataParserConfig(data=write_native(tmp_path / "made")))
+def test_way_back_to_the_world(native: Path, tmp_path: Path) -> None:
+    outputs = parse(NativeDataParserConfig(data=native))
     outputs.save_dataparser_transform(tmp_path / "dataparser_transforms.json")
     scene_opengl = outputs.metadata[SCENE_KEY].trajectory.camera_to_worlds.numpy()
     points, poses = runpy.run_path(str(EXAMPLES / "scene_to_world.py"))["load_world_from_scene"](tmp_path)
@@ -83,10 +82,9 @@ def test_way_back_to_the_world(tmp_path: Path) -> None:
     np.testing.assert_allclose(points(scene_opengl[:, :, 3]), expected, rtol=0, atol=1e-5)
 
 
-def test_supervision_of_your_own(tmp_path: Path) -> None:
-    data = write_native(tmp_path / "made")
+def test_supervision_of_your_own(native: Path, tmp_path: Path) -> None:
     with own_log():
-        runpy.run_path(str(EXAMPLES / "add_a_supervision.py"))["main"](data, tmp_path / "outputs", 3)
+        runpy.run_path(str(EXAMPLES / "add_a_supervision.py"))["main"](native, tmp_path / "outputs", 3)
     assert list((tmp_path / "outputs").rglob("step-000000002.ckpt"))
 
 

@@ -10,7 +10,6 @@ from typing import Any
 import pytest
 import torch
 import tyro
-from helpers.small_datasets import write_native
 from helpers.small_models import SMALL_FIELD, SMALL_PROPOSAL
 from nerfstudio.engine.optimizers import Optimizers
 from nerfstudio.engine.trainer import TrainerConfig
@@ -26,11 +25,6 @@ from aenerf_ns.training.pipeline import AENeRFPipeline
 SMALL = [
     peers.robust_enerf_small, peers.eventnerf_small, peers.evnerf_small, peers.paev3d_small, peers.e2vid_nerf_small
 ]  # fmt: skip
-
-
-@pytest.fixture
-def data(tmp_path: Path) -> Path:
-    return write_native(tmp_path / "made")
 
 
 def with_options(config: TrainerConfig, *options: str) -> TrainerConfig:
@@ -69,8 +63,8 @@ def train(config: TrainerConfig, data: Path, num_steps: int) -> tuple[list[dict[
 
 
 @pytest.mark.parametrize("config", [shrunk(deepcopy(aenerf_mlp.config)), deepcopy(aenerf_mlp_small.config)])
-def test_the_papers_recipe_trains_by_its_losses_alone(config: TrainerConfig, data: Path) -> None:
-    history, pipeline = train(config, data, 3)
+def test_the_papers_recipe_trains_by_its_losses_alone(config: TrainerConfig, native: Path) -> None:
+    history, pipeline = train(config, native, 3)
     assert pipeline.model.warp is None
     assert set(history[-1]) == {"reconstruction_loss", "temporal_loss", "interlevel_loss", "distortion_loss"}
     assert all(history[-1].values())
@@ -94,9 +88,9 @@ def test_robust_enerf_is_aenerf_with_options(robust: Any, ours: Any) -> None:
 
 @pytest.mark.parametrize("mode", ["off", "spline"])
 @pytest.mark.parametrize("method", SMALL, ids=lambda method: method.config.method_name)
-def test_peers_train_with_and_without_correction(method: Any, mode: str, data: Path) -> None:
+def test_peers_train_with_and_without_correction(method: Any, mode: str, native: Path) -> None:
     config = with_options(method.config, "--pipeline.model.camera-optimizer.mode", mode)
-    history, pipeline = train(shrunk(config), data, 3)
+    history, pipeline = train(shrunk(config), native, 3)
     assert len({losses["reconstruction_loss"] for losses in history}) == 3
     # Ev-NeRF also learns the thresholds, which begin as the dataset's.
     assert pipeline.model.supervision.learned_values().get("positive_threshold") != pytest.approx(0.3, abs=1e-3)

@@ -11,7 +11,7 @@ import torch
 import torch.nn.functional as F
 from helpers.dataset_faults import set_in
 from helpers.published_datasets import DURATION, EPOCH, config_of, seconds, write_images, write_own
-from helpers.small_datasets import END, START, make_trajectory, parse, write_ecd, write_native
+from helpers.small_datasets import END, START, make_trajectory, parse, write_native
 from helpers.unpacked_pairs import unpacked
 
 from aenerf_ns.camera.time_window import TimeWindow
@@ -27,9 +27,8 @@ from aenerf_ns.recording.recording import Recording
 from aenerf_ns.recording.scene import SCENE_KEY
 
 
-def test_all_splits_share_the_reported_world(tmp_path: Path) -> None:
-    folder = write_native(tmp_path / "made")
-    config = NativeDataParserConfig(data=folder)
+def test_all_splits_share_the_reported_world(native: Path) -> None:
+    config = NativeDataParserConfig(data=native)
     train, test = parse(config), parse(config, "test")
     assert train.dataparser_scale == test.dataparser_scale
     assert torch.equal(train.dataparser_transform, test.dataparser_transform)
@@ -61,8 +60,8 @@ def test_scene_box_sets_scale_and_bounds(tmp_path: Path) -> None:
     torch.testing.assert_close(first, torch.tensor([-1.0, -1.0, 1.5], dtype=torch.float64) / 3)
 
 
-def test_training_cameras_show_images_or_events(tmp_path: Path) -> None:
-    dataset = EventDataset(parse(NativeDataParserConfig(data=write_native(tmp_path / "made"))))
+def test_training_cameras_show_images_or_events(native: Path) -> None:
+    dataset = EventDataset(parse(NativeDataParserConfig(data=native)))
     has_image = dataset.scene.has_image
     # The 21 knots, two of them image times, and one image between two knots.
     assert len(dataset) == 22
@@ -73,10 +72,9 @@ def test_training_cameras_show_images_or_events(tmp_path: Path) -> None:
     assert (picture.max(-1) != picture.min(-1)).any()
 
 
-def test_time_window_leaves_out_the_rest(tmp_path: Path) -> None:
-    folder = write_native(tmp_path / "made")
+def test_time_window_leaves_out_the_rest(native: Path) -> None:
     start, end = START + 500_000_000, START + 1_050_000_000
-    dataset = EventDataset(parse(NativeDataParserConfig(data=folder, start_time_ns=start, end_time_ns=end)))
+    dataset = EventDataset(parse(NativeDataParserConfig(data=native, start_time_ns=start, end_time_ns=end)))
     trajectory = dataset.scene.trajectory
     assert (trajectory.start, trajectory.end) == (start, START + 1_100_000_000)
     assert not any(dataset.scene.has_image)
@@ -85,37 +83,35 @@ def test_time_window_leaves_out_the_rest(tmp_path: Path) -> None:
     assert max(last for _, last in intervals) <= end
     assert dataset.pairs.num_outside > 0
     # The window is cut to the poses.
-    config = NativeDataParserConfig(data=folder, start_time_ns=0, end_time_ns=END + 10**12)
+    config = NativeDataParserConfig(data=native, start_time_ns=0, end_time_ns=END + 10**12)
     assert parse(config).metadata[SCENE_KEY].window == TimeWindow(START, END)
     with pytest.raises(DataError, match="nothing is left from 9 to 9 ns"):
-        parse(NativeDataParserConfig(data=folder, start_time_ns=9, end_time_ns=9))
-    with h5py.File(folder / "events.h5", "a") as file:
+        parse(NativeDataParserConfig(data=native, start_time_ns=9, end_time_ns=9))
+    with h5py.File(native / "events.h5", "a") as file:
         file["events/t"][:] = START
     with pytest.raises(DataError, match=f"all its events are at {START} ns; check the unit of the times"):
-        parse(NativeDataParserConfig(data=folder))
+        parse(NativeDataParserConfig(data=native))
 
 
-def test_refuse_reference_views_far_away(tmp_path: Path) -> None:
+def test_refuse_reference_views_far_away(native: Path) -> None:
     # True poses in a geodetic frame: single precision, which the framework's cameras have, would displace them.
-    folder = write_native(tmp_path / "scene")
     truth = make_trajectory()
     far = Trajectory(truth.times, truth.camera_to_worlds + torch.tensor([[0, 0, 0, 4e5]], dtype=torch.float64))
-    write_tum_trajectory(folder / "trajectory_ground_truth.txt", far)
+    write_tum_trajectory(native / "trajectory_ground_truth.txt", far)
     for index in range(6):
-        set_in("transforms.json", "frames", index, "transform_matrix", 0, 3, value=4e5)(folder)
-    config = NativeDataParserConfig(data=folder)
+        set_in("transforms.json", "frames", index, "transform_matrix", 0, 3, value=4e5)(native)
+    config = NativeDataParserConfig(data=native)
     assert len(parse(config, "train").image_filenames)
     message = r"ground_truth.txt: a reference view is .* times as far .*; subtract one offset"
     with pytest.raises(DataError, match=message):
         parse(config, "test")
 
 
-def test_refuse_scale_of_turning_camera(tmp_path: Path) -> None:
-    folder = write_ecd(tmp_path / "made")
-    (folder / "groundtruth.txt").write_text("0 1 2 3 0 0 0 1\n1 1 2 3 0 0 0 1\n")
-    parse(EcdDataParserConfig(data=folder))
+def test_refuse_scale_of_turning_camera(ecd: Path) -> None:
+    (ecd / "groundtruth.txt").write_text("0 1 2 3 0 0 0 1\n1 1 2 3 0 0 0 1\n")
+    parse(EcdDataParserConfig(data=ecd))
     with pytest.raises(DataError, match="--auto-scale-poses False"):
-        parse(EcdDataParserConfig(data=folder, auto_scale_poses=True))
+        parse(EcdDataParserConfig(data=ecd, auto_scale_poses=True))
 
 
 def test_images_are_thinned_within_the_window(tmp_path: Path) -> None:
@@ -155,17 +151,16 @@ def test_refuse_times_beyond_64_bits(option: str, value: int, tmp_path: Path) ->
 
 
 def test_windows_read_the_events_once(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    native: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    folder = write_native(tmp_path / "made")
     start, end = START + 500_000_000, START + 1_050_000_000
-    outputs = parse(NativeDataParserConfig(data=folder, start_time_ns=start, end_time_ns=end))
+    outputs = parse(NativeDataParserConfig(data=native, start_time_ns=start, end_time_ns=end))
     reads = []
     original = Hdf5EventFile.read_chunks
     monkeypatch.setattr(Hdf5EventFile, "read_chunks", lambda file: reads.append(file) or original(file))
     dataset = EventDataset(outputs)
     windows = dataset.windows
-    with h5py.File(folder / "events.h5") as file:
+    with h5py.File(native / "events.h5") as file:
         times = file["events/t"][()]
     inside = (times > start) & (times <= end)
     assert windows.counts(start, end).sum() == inside.sum() > 20
@@ -176,7 +171,7 @@ def test_windows_read_the_events_once(
     assert len(reads) == 1
 
 
-def test_a_format_that_cannot_do_without_poses_says_which_are_missing(tmp_path: Path) -> None:
+def test_a_format_that_cannot_do_without_poses_says_which_are_missing(native: Path) -> None:
     class Parser(EventDataParser):
         def poses_path(self) -> Path:
             return self.data / "poses.txt"
@@ -185,4 +180,4 @@ def test_a_format_that_cannot_do_without_poses_says_which_are_missing(tmp_path: 
             raise AssertionError(read_tum_trajectory(self.poses_path()))
 
     with pytest.raises(DataError, match=r"poses.txt: there is no such file"):
-        Parser(NativeDataParserConfig(data=write_native(tmp_path / "made"))).read_frames()
+        Parser(NativeDataParserConfig(data=native)).read_frames()

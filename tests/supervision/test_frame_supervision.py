@@ -10,7 +10,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
-from helpers.small_datasets import AS_RECORDED, END, START, parse, write_native
+from helpers.small_datasets import AS_RECORDED, END, START, parse
 from helpers.small_models import EPOCH, KNOTS, make_scene, make_supervision, pixels_of
 from PIL import Image
 
@@ -89,9 +89,8 @@ def test_images_that_cannot_be_trained_on_end_with_one_line(random_poses: torch.
         sampler.prepare()
 
 
-def test_a_dataset_hands_on_the_timed_training_images_of_the_event_camera(tmp_path: Path) -> None:
-    data = write_native(tmp_path / "made")
-    config = NativeDataParserConfig(data=data, start_time_ns=START, end_time_ns=END, **AS_RECORDED)
+def test_a_dataset_hands_on_the_timed_training_images_of_the_event_camera(native: Path) -> None:
+    config = NativeDataParserConfig(data=native, start_time_ns=START, end_time_ns=END, **AS_RECORDED)
     frames = parse(config).metadata[SCENE_KEY].frames
     assert [(time, file.name) for time, file in frames] == [
         (START, "00000.png"),
@@ -101,7 +100,7 @@ def test_a_dataset_hands_on_the_timed_training_images_of_the_event_camera(tmp_pa
     assert parse(config, "test").metadata[SCENE_KEY].frames == ()
     config.start_time_ns, config.end_time_ns = START + 1, END - 1
     assert [time for time, _ in parse(config).metadata[SCENE_KEY].frames] == [START + 150_000_000]
-    meta = json.loads((data / "transforms.json").read_text())
+    meta = json.loads((native / "transforms.json").read_text())
     meta["fl_x"] += 1
-    (data / "transforms.json").write_text(json.dumps(meta))
+    (native / "transforms.json").write_text(json.dumps(meta))
     assert parse(config).metadata[SCENE_KEY].frames == ()
