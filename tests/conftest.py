@@ -65,6 +65,14 @@ def _seeded() -> None:
 
 
 @pytest.fixture
+def threads() -> Iterator[None]:
+    """Lets a test change the number of torch's threads."""
+    num_threads = torch.get_num_threads()
+    yield
+    torch.set_num_threads(num_threads)
+
+
+@pytest.fixture
 def random_poses() -> torch.Tensor:
     """(8, 3, 4) float64 random camera-to-world poses with rotations up to 2.5 rad."""
     generator = torch.Generator().manual_seed(0)

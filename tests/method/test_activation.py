@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import partial
 
-import pytest
 import torch
 import torch.autograd.forward_ad as forward_ad
 import torch.nn.functional as F
@@ -60,11 +58,10 @@ def test_values_that_are_not_finite_stay_so() -> None:
     assert outputs[2].isnan()
 
 
-def test_every_number_of_threads_gives_the_same_bytes(request: pytest.FixtureRequest) -> None:
-    request.addfinalizer(partial(torch.set_num_threads, torch.get_num_threads()))
+def test_every_number_of_threads_gives_the_same_bytes(threads: None) -> None:
     inputs, results = torch.randn(3, 5000, generator=torch.Generator().manual_seed(1)), []
-    for threads in (1, 3):
-        torch.set_num_threads(threads)
+    for num_threads in (1, 3):
+        torch.set_num_threads(num_threads)
         results.append(SharpSoftplus()(inputs))
     assert torch.equal(*results)
 

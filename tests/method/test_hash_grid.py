@@ -66,14 +66,6 @@ def implementation(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPat
     return request.param
 
 
-@pytest.fixture
-def threads() -> Iterator[None]:
-    """Lets a test change the number of torch's threads."""
-    num_threads = torch.get_num_threads()
-    yield
-    torch.set_num_threads(num_threads)
-
-
 def make_pair(implementation: str, **options: int) -> tuple[HashEncoding, HashEncoding]:
     """The plain and a fast encoding with one table, on the device of the fast one."""
     device = "cuda" if implementation == "triton" and torch.cuda.is_available() else "cpu"

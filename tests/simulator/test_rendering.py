@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import sys
-from functools import partial
 
 import numpy as np
 import pytest
@@ -111,14 +110,13 @@ def test_edge_is_blurred_by_the_point_spread() -> None:
     np.testing.assert_allclose(gray, 0.5 * norm.cdf(shifts, scale=0.5), atol=0.01)
 
 
-def test_threads_do_not_change_pictures(request: pytest.FixtureRequest) -> None:
-    request.addfinalizer(partial(torch.set_num_threads, torch.get_num_threads()))
+def test_threads_do_not_change_pictures(threads: None) -> None:
     mesh, _ = repair(mesh_of(trimesh.creation.icosphere(3)), 0.2)
     lamp = AreaLight((0.5, 0, 2.0), (0.3, 0, 0), (0, -0.3, 0), (1.0, 2.0, 3.0))
     pose = paths.look_at((3, 1, 1), (0, 0, 0))
     pictures = []
-    for threads in (1, 3):
-        torch.set_num_threads(threads)
+    for num_threads in (1, 3):
+        torch.set_num_threads(num_threads)
         scene = light_mesh(mesh, sky((0.1,) * 3, (1.0,) * 3), [lamp], BLACK)
         pictures.append(b"".join(part.tobytes() for part in scene.render(pose, (50, 50, 20, 15), 40, 30, 4)))
     assert pictures[0] == pictures[1]
