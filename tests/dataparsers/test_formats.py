@@ -25,14 +25,13 @@ from aenerf_ns.training.datamanager import EventDataManagerConfig
 
 
 @pytest.fixture(params=WRITERS)
-def written(request: pytest.FixtureRequest, tmp_path: Path) -> tuple[str, Truth]:
-    """A dataset of every format, under its name."""
-    return request.param, WRITERS[request.param](tmp_path / "made")
+def truth(request: pytest.FixtureRequest, tmp_path: Path) -> Truth:
+    """A dataset of every format."""
+    return replace(WRITERS[request.param](tmp_path / "made"), format=request.param)
 
 
-def test_poses_and_events_are_those_written(written: tuple[str, Truth]) -> None:
-    name, truth = written
-    recording = recording_of(config_of(name, truth.data))
+def test_poses_and_events_are_those_written(truth: Truth) -> None:
+    recording = recording_of(config_of(truth.format, truth.data))
     np.testing.assert_array_equal(recording.trajectory.times.numpy(), truth.times)
     assert_same_poses(recording.trajectory.camera_to_worlds, truth.poses)
     events = np.stack([truth.events[column].astype(np.int64) for column in "xytp"], -1) * [1, 1, 1_000, 1]
@@ -40,9 +39,8 @@ def test_poses_and_events_are_those_written(written: tuple[str, Truth]) -> None:
     assert recording.event_file.time_span() == (truth.events["t"][0] * 1_000, truth.events["t"][-1] * 1_000)
 
 
-def test_rays_are_those_of_opencv(written: tuple[str, Truth]) -> None:
-    name, truth = written
-    camera = recording_of(config_of(name, truth.data)).event_camera
+def test_rays_are_those_of_opencv(truth: Truth) -> None:
+    camera = recording_of(config_of(truth.format, truth.data)).event_camera
     assert (camera.width, camera.height) == (truth.width, truth.height)
     project = cv2.fisheye.projectPoints if truth.fisheye else cv2.projectPoints
     lens = np.array(truth.distortion or (0.0,) * 4)
@@ -57,11 +55,10 @@ def test_rays_are_those_of_opencv(written: tuple[str, Truth]) -> None:
         np.testing.assert_allclose(pixels[..., 1], np.arange(v, v + 7)[:, None].repeat(9, 1), rtol=0, atol=1e-6)
 
 
-def test_conversion_to_native_changes_nothing(written: tuple[str, Truth], tmp_path: Path) -> None:
-    name, truth = written
+def test_conversion_to_native_changes_nothing(truth: Truth, tmp_path: Path) -> None:
     Convert(truth.data, tmp_path / "native").main()
     native = NativeDataParserConfig(data=tmp_path / "native", **AS_RECORDED)
-    configs = config_of(name, truth.data, **AS_RECORDED), native
+    configs = config_of(truth.format, truth.data, **AS_RECORDED), native
     before, after = (parse(config).metadata[SCENE_KEY] for config in configs)
     # Equal lenses have equal rays.
     for key in ("event_camera", "sensor", "window", "image_encoding", "bounded"):
@@ -71,13 +68,12 @@ def test_conversion_to_native_changes_nothing(written: tuple[str, Truth], tmp_pa
     np.testing.assert_array_equal(read(before.event_file), read(after.event_file))
 
 
-def test_hidden_files_of_macos_change_nothing(written: tuple[str, Truth]) -> None:
-    name, truth = written
-    before = recording_of(config_of(name, truth.data))
+def test_hidden_files_of_macos_change_nothing(truth: Truth) -> None:
+    before = recording_of(config_of(truth.format, truth.data))
     for path in list(truth.data.rglob("*")):
         path.with_name(f"._{path.name}").write_bytes(b"\0\5\26\7")
-    assert recognize(truth.data) == name
-    after = recording_of(config_of(name, truth.data))
+    assert recognize(truth.data) == truth.format
+    after = recording_of(config_of(truth.format, truth.data))
     np.testing.assert_array_equal(read(after.event_file), read(before.event_file))
     for split, views in before.reference_views.items():
         assert [view.file for view in after.reference_views[split]] == [view.file for view in views]
@@ -96,21 +92,18 @@ FILES = {
 }
 
 
-def test_run_opens_without_events_and_elsewhere(
-    written: tuple[str, Truth], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    name, truth = written
-    assert recognize(truth.data) == name
+def test_run_opens_without_events_and_elsewhere(truth: Truth, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert recognize(truth.data) == truth.format
     monkeypatch.chdir(tmp_path)
     config = EventDataManagerConfig(dataparser=AutomaticDataParserConfig(data=Path(truth.data.name)))
     manager = config.setup(device="cpu", test_mode="inference", world_size=1, local_rank=0)
     resolved = manager.resolved_config()
-    assert type(resolved.dataparser) is type(FORMATS[name])
+    assert type(resolved.dataparser) is type(FORMATS[truth.format])
     # The defaults, which all runs share, are unchanged.
-    assert FORMATS[name].start_time_ns is None
-    assert FORMATS[name].data == type(FORMATS[name])().data
+    assert FORMATS[truth.format].start_time_ns is None
+    assert FORMATS[truth.format].data == type(FORMATS[truth.format])().data
     saved = yaml.dump(resolved)
-    remove(FILES[name][0])(truth.data)
+    remove(FILES[truth.format][0])(truth.data)
     (tmp_path / "elsewhere").mkdir()
     monkeypatch.chdir(tmp_path / "elsewhere")
     again = yaml.load(saved, Loader=yaml.Loader).setup(device="cpu", test_mode="inference", world_size=1, local_rank=0)
@@ -152,18 +145,17 @@ def test_errors_say_that_the_format_was_guessed(tmp_path: Path) -> None:
     assert "guessed" not in str(error.value)
 
 
-def test_poses_may_be_missing(written: tuple[str, Truth]) -> None:
-    name, truth = written
-    known = recording_of(config_of(name, truth.data))
-    _, poses, num_frames = FILES[name]
+def test_poses_may_be_missing(truth: Truth) -> None:
+    known = recording_of(config_of(truth.format, truth.data))
+    _, poses, num_frames = FILES[truth.format]
     remove(poses)(truth.data)
     # The other files of EDS are those of many formats.
-    if name == "eds-data":
+    if truth.format == "eds-data":
         (truth.data / "calibration.json").write_text("{}")
         assert recognize(truth.data) == "event-recording-data"
     else:
-        assert recognize(truth.data) == name
-    parser = config_of(name, truth.data).setup()
+        assert recognize(truth.data) == truth.format
+    parser = config_of(truth.format, truth.data).setup()
     with pytest.raises(DataError, match=r"no such poses; .* aenerf convert DATA --output FOLDER --poses events"):
         parser.get_dataparser_outputs("train")
     capture, frames = parser.read_frames()
@@ -173,12 +165,11 @@ def test_poses_may_be_missing(written: tuple[str, Truth]) -> None:
     assert capture.event_file.path == known.event_file.path
 
 
-def test_estimated_poses_may_be_given(written: tuple[str, Truth], tmp_path: Path) -> None:
-    name, truth = written
+def test_estimated_poses_may_be_given(truth: Truth, tmp_path: Path) -> None:
     other = truth.poses.copy()
     other[:, :3, 3] += 0.01
     write_poses(tmp_path / "other.txt", other, seconds(truth.times))
-    recording = recording_of(config_of(name, truth.data, trajectory=tmp_path / "other.txt"))
+    recording = recording_of(config_of(truth.format, truth.data, trajectory=tmp_path / "other.txt"))
     assert recording.ground_truth is not None
     assert_same_poses(recording.ground_truth.camera_to_worlds, truth.poses)
     assert_same_poses(recording.trajectory.camera_to_worlds, other)

@@ -29,8 +29,8 @@ DURATION = 2_000_000
 
 @dataclass(frozen=True)
 class Truth:
-    """The content of a written dataset: OpenCV camera-to-world poses (N, 4, 4) with times in ns, events, and the lens
-    in OpenCV's terms."""
+    """The content of a written dataset: OpenCV camera-to-world poses (N, 4, 4) with times in ns, events, the lens in
+    OpenCV's terms, and the name of the format in tests of every format."""
 
     data: Path
     times: NDArray[np.int64]
@@ -41,6 +41,7 @@ class Truth:
     matrix: NDArray[np.float64]
     distortion: tuple[float, ...]
     fisheye: bool = False
+    format: str = ""
 
 
 def make_poses(count: int = N_POSES) -> NDArray[np.float64]:
