@@ -15,7 +15,7 @@ from aenerf_ns.errors import DataError
 from aenerf_ns.simulator import paths
 from aenerf_ns.simulator.open_scene import open_scene
 from aenerf_ns.simulator.rendering.lighting import baked_mesh
-from aenerf_ns.simulator.rendering.mesh import normals_and_areas, scaled
+from aenerf_ns.simulator.rendering.mesh import Mesh, normals_and_areas, scaled
 from aenerf_ns.simulator.rendering.mesh_loading import load_mesh
 
 pytestmark = pytest.mark.usefixtures("small_work")
@@ -25,6 +25,13 @@ def seen(path: Path, up: str) -> np.ndarray:
     scene = baked_mesh(scaled(load_mesh(path, up == "y"), 1.0), BLACK)
     pose = paths.look_at((2.0, -1.5, 1.3), (0, 0, 0))
     return scene.render(pose, (60, 60, 32, 24), 64, 48, 1)[0]
+
+
+def load_obj(folder: Path, text: str, materials: str = "") -> Mesh:
+    """Load a mesh of a.obj, beside its materials in a.mtl."""
+    (folder / "a.mtl").write_text(materials, encoding="utf-8")
+    (folder / "a.obj").write_text(text, encoding="utf-8")
+    return load_mesh(folder / "a.obj", False)
 
 
 def test_glb_and_obj_look_alike(tmp_path: Path) -> None:
@@ -75,12 +82,11 @@ def test_ply_colors_are_srgb(tmp_path: Path) -> None:
 
 
 def test_obj_with_concave_polygon(tmp_path: Path) -> None:
-    (tmp_path / "a.mtl").write_text("newmtl red\nKd 0.7 0.1 0.1\n newmtl\tgreen\nKd 0.1 0.6 0.1\n")
-    (tmp_path / "a.obj").write_text(
+    text = (
         "mtllib a.mtl\nv 0 0 0\nv 1 1 0\nv 0 2 0\nv 0.4 1 0\nusemtl red\nf 1 2 \\\r\n3 4 # concave\n"
         "v 2 0 0\nv 3 0 0\nv 3 1 0\nusemtl green\nf -3 -2 -1#flat\n"
     )
-    mesh = scaled(load_mesh(tmp_path / "a.obj", False), 2.0)
+    mesh = scaled(load_obj(tmp_path, text, "newmtl red\nKd 0.7 0.1 0.1\n newmtl\tgreen\nKd 0.1 0.6 0.1\n"), 2.0)
     # The notch is not filled; the scale is applied; the first material comes first.
     np.testing.assert_allclose(normals_and_areas(mesh)[1].sum(), 4 * (0.6 + 0.5), rtol=1e-6)
     np.testing.assert_allclose(mesh.color[mesh.faces[0]], [[0.7, 0.1, 0.1]] * 3)
@@ -88,29 +94,23 @@ def test_obj_with_concave_polygon(tmp_path: Path) -> None:
 
 
 def test_obj_vertex_colors_beside_a_material(tmp_path: Path) -> None:
-    (tmp_path / "a.mtl").write_text("newmtl a\nKd 0.5 1 1\n")
     colored = "mtllib a.mtl\nv 0 0 0 1 0.5 0\nv 1 0 0 1 0.5 0\nv 0 1 0 1 0.5 0\nusemtl a\nf 1 2 3\n"
-    (tmp_path / "a.obj").write_text(colored)
-    mesh = load_mesh(tmp_path / "a.obj", False)
+    mesh = load_obj(tmp_path, colored, "newmtl a\nKd 0.5 1 1\n")
     np.testing.assert_allclose(mesh.color[mesh.faces], [[[0.5, float(decode(np.array(0.5), "srgb")), 0]] * 3])
 
 
 def test_obj_vertex_colors_without_a_color_of_a_material(tmp_path: Path) -> None:
-    (tmp_path / "a.mtl").write_text("newmtl a\nKs 1 1 1\n")
     corners = "v 0 0 0 1 0 0\nv 1 0 0 1 0 0\nv 0 1 0 1 0 0\nvt 0 0\n"
     for named in ("", "mtllib a.mtl\nusemtl a\n"):
-        (tmp_path / "a.obj").write_text(f"{corners}{named}f 1/1 2/1 3/1\n")
-        mesh = load_mesh(tmp_path / "a.obj", False)
+        mesh = load_obj(tmp_path, f"{corners}{named}f 1/1 2/1 3/1\n", "newmtl a\nKs 1 1 1\n")
         np.testing.assert_allclose(mesh.color[mesh.faces], [[[1, 0, 0]] * 3])
 
 
 def test_colors_of_unusual_material_files(tmp_path: Path) -> None:
     materials = "\ufeffnewmtl a\nKd 0.2 0.3 0.4 # blue\nKs 0.5\nnewmtl b\nKd 0.6\n"
-    (tmp_path / "a.mtl").write_text(materials, encoding="utf-8")
     corners = "v 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\n"
     faces = "f 1/1 2/1 3/1\nusemtl a\nf 1/1 2/1 3/1\nusemtl b\nf 1/1 2/1 3/1\n"
-    (tmp_path / "a.obj").write_text(f"mtllib a.mtl\n{corners}{faces}")
-    mesh = load_mesh(tmp_path / "a.obj", False)
+    mesh = load_obj(tmp_path, f"mtllib a.mtl\n{corners}{faces}", materials)
     # A face without a material is as gray as in a file without materials.
     np.testing.assert_allclose(mesh.color[mesh.faces][:, 0], [[0.5] * 3, [0.2, 0.3, 0.4], [0.6] * 3])
     assert mesh.textures == ()
@@ -118,32 +118,28 @@ def test_colors_of_unusual_material_files(tmp_path: Path) -> None:
 
 def test_obj_counts_back_from_each_face(tmp_path: Path) -> None:
     part = "v 0 0 {z}\nv 1 0 {z}\nv 0 1 {z}\nvt 0 0\nvt {z} 0\nvt 0 1\nf {face}\n"
-    (tmp_path / "a.mtl").write_text("newmtl a\nmap_Kd a.png\n")
     Image.new("RGB", (2, 2)).save(tmp_path / "a.png")
     for corners in ("-3 -2 -1", "-3/-3 -2/-2 -1/-1", "-3/-3/ -2/-2/ -1/-1/"):
         parts = part.format(z=1, face=corners) + part.format(z=2, face=corners)
-        (tmp_path / "a.obj").write_text(f"mtllib a.mtl\nusemtl a\n{parts}")
-        mesh = load_mesh(tmp_path / "a.obj", False)
+        mesh = load_obj(tmp_path, f"mtllib a.mtl\nusemtl a\n{parts}", "newmtl a\nmap_Kd a.png\n")
         assert mesh.vertices[mesh.faces].tolist() == [[[0, 0, z], [1, 0, z], [0, 1, z]] for z in (1, 2)]
         if "/" in corners:
             assert mesh.uv[mesh.faces].tolist() == [[[0, 0], [z, 0], [0, 1]] for z in (1, 2)]
 
 
 def test_obj_keeps_its_texture_beside_a_face_without_coordinates(tmp_path: Path) -> None:
-    (tmp_path / "a.mtl").write_text("newmtl a\nmap_Kd a.png\n")
     Image.new("RGB", (2, 2)).save(tmp_path / "a.png")
     corners = "v 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0.2 0.3\nvn 0 0 1\n"
     for bare in ("f  1 3  2", "f 1//1 3//1 2//1"):
-        (tmp_path / "a.obj").write_text(f"mtllib a.mtl\n{corners}usemtl a\nf 1/1/1 2/1/1 3/1/1\n{bare}\n")
-        mesh = load_mesh(tmp_path / "a.obj", False)
+        text = f"mtllib a.mtl\n{corners}usemtl a\nf 1/1/1 2/1/1 3/1/1\n{bare}\n"
+        mesh = load_obj(tmp_path, text, "newmtl a\nmap_Kd a.png\n")
         assert mesh.texture.tolist() == [0, 0]
         assert mesh.uv[mesh.faces].tolist() == [[[0.2, 0.3]] * 3, [[0, 0]] * 3]
         assert mesh.vertices[mesh.faces[1]].tolist() == [[0, 0, 0], [0, 1, 0], [1, 0, 0]]
 
 
 def test_obj_with_tabs_leading_zeros_and_a_byte_order_mark(tmp_path: Path) -> None:
-    (tmp_path / "a.obj").write_text("\ufeffv\t0 0 0\n\tv 2\t0 0\nv\t0 2 0\nf\t01\t02 03\n", encoding="utf-8")
-    mesh = load_mesh(tmp_path / "a.obj", False)
+    mesh = load_obj(tmp_path, "\ufeffv\t0 0 0\n\tv 2\t0 0\nv\t0 2 0\nf\t01\t02 03\n")
     assert mesh.vertices[mesh.faces].tolist() == [[[0, 0, 0], [2, 0, 0], [0, 2, 0]]]
 
 
