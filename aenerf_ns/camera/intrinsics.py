@@ -182,10 +182,6 @@ class CameraIntrinsics:
     def _named_distortion(self) -> dict[str, float]:
         return dict(zip(_PARAMETERS[self.lens_model], self.distortion, strict=True))
 
-    @property
-    def _opencv_matrix(self) -> NDArray[np.float64]:
-        return np.array([[self.fx, 0, self.cx - 0.5], [0, self.fy, self.cy - 0.5], [0, 0, 1.0]])
-
     def pixel_directions(self) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
         """Return the directions through the pixel centers, undistorted to the last digit.
 
@@ -210,7 +206,9 @@ class CameraIntrinsics:
         shape = len(rows), len(columns)
         columns, rows = np.meshgrid(columns.astype(np.float64), rows.astype(np.float64))
         pixels = np.stack([columns, rows], -1).reshape(-1, 1, 2)
-        matrix, distortion = self._opencv_matrix, np.array(self.distortion)
+        # OpenCV counts from the center of the first pixel.
+        matrix = np.array([[self.fx, 0, self.cx - 0.5], [0, self.fy, self.cy - 0.5], [0, 0, 1.0]])
+        distortion = np.array(self.distortion)
         if self.lens_model == "fisheye":
             criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-14)
             plane = cv2.fisheye.undistortPoints(pixels, matrix, distortion, criteria=criteria)

@@ -20,11 +20,6 @@ OF_EACH_LENS = pytest.mark.parametrize(
 )
 
 
-def opencv_matrix(camera: CameraIntrinsics) -> np.ndarray:
-    # OpenCV counts from the center of the first pixel.
-    return np.array([[camera.fx, 0, camera.cx - 0.5], [0, camera.fy, camera.cy - 0.5], [0, 0, 1]])
-
-
 @OF_EACH_LENS
 def test_opencv_projects_directions_onto_pixels(camera: CameraIntrinsics) -> None:
     directions, has_direction = camera.pixel_directions()
@@ -32,7 +27,9 @@ def test_opencv_projects_directions_onto_pixels(camera: CameraIntrinsics) -> Non
     np.testing.assert_allclose(np.linalg.norm(directions, axis=-1), 1, atol=1e-15)
     points = (directions * [1, -1, -1]).reshape(-1, 1, 3) * 3.7
     project = cv2.fisheye.projectPoints if camera.lens_model == "fisheye" else cv2.projectPoints
-    pixels, _ = project(points, np.zeros(3), np.zeros(3), opencv_matrix(camera), np.array(camera.distortion))
+    # OpenCV counts from the center of the first pixel.
+    matrix = np.array([[camera.fx, 0, camera.cx - 0.5], [0, camera.fy, camera.cy - 0.5], [0, 0, 1]])
+    pixels, _ = project(points, np.zeros(3), np.zeros(3), matrix, np.array(camera.distortion))
     pixels = pixels.reshape(-1, 2)
     columns, rows = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
     np.testing.assert_allclose(pixels, np.stack([columns, rows], -1).reshape(-1, 2), atol=1e-8)
