@@ -13,11 +13,10 @@ from numpy.typing import NDArray
 
 from aenerf_ns.camera.intrinsics import CameraIntrinsics
 from aenerf_ns.camera.trajectory import OPENCV_TO_OPENGL
+from aenerf_ns.recording.recording import SPLITS, Split
 
 IMAGE_FOLDER, SPARSE_FOLDER, TRANSFORMS_FILE, POINTS_FILE = "images", "sparse/0", "transforms.json", "points.ply"
 """Names of the written folders and files. Trainers of splats and NeRFs look for these names."""
-
-_SPLITS = ("train", "val", "test")
 
 
 @dataclass(frozen=True)
@@ -123,12 +122,12 @@ def _write_transforms(folder: Path, images: Sequence[PlacedImage], points: Obser
     trimesh.PointCloud(points.positions, colors=points.colors).export(folder / POINTS_FILE)
 
 
-def _names_by_split(images: Sequence[PlacedImage], prefix: str) -> dict[str, list[str]]:
+def _names_by_split(images: Sequence[PlacedImage], prefix: str) -> dict[Split, list[str]]:
     """List the images' names by split; an empty dictionary where images are not split.
 
     A split without images gets those of the other held-out split, because the framework asks for all three.
     """
-    names = {split: [prefix + image.name for image in images if image.split == split] for split in _SPLITS}
+    names = {split: [prefix + image.name for image in images if image.split == split] for split in SPLITS}
     if not names["train"] or not (names["val"] or names["test"]):
         return {}
     return {**names, "val": names["val"] or names["test"], "test": names["test"] or names["val"]}
