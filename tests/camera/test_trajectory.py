@@ -120,10 +120,10 @@ def test_no_spline_crosses_a_long_gap(lost: int) -> None:
     assert halves[0].item() == pytest.approx(halves[1].item(), rel=1e-9)
     assert halves.sum().item() == pytest.approx(degrees_between(*ends).item(), rel=1e-9)
     # On both sides the spline is as good as without the gap, and it does not depend on the other side.
-    for part, kept in ((slice(0, 40), slice(0, 40)), (slice(40, 80), slice(40, 80))):
+    for part in (slice(0, 40), slice(40, 80)):
         fine = torch.linspace(seconds[part][0], seconds[part][-1], 100, dtype=torch.float64)
-        alone = Trajectory(times[kept], smooth_poses(seconds[kept]))
-        expected = alone.pose((fine - seconds[kept][0]).clamp_min(0))
+        alone = Trajectory(times[part], smooth_poses(seconds[part]))
+        expected = alone.pose((fine - seconds[part][0]).clamp_min(0))
         torch.testing.assert_close(trajectory.pose(fine)[:-1], expected[:-1], rtol=0, atol=1e-10)
         assert degrees_between(trajectory.pose(fine), smooth_poses(fine.numpy())).max() < 1e-3
 
@@ -225,8 +225,7 @@ def test_trajectory_adds_nothing_to_checkpoints(random_poses: torch.Tensor) -> N
 
 def test_pose_noise_is_sized_smooth_and_seeded(random_poses: torch.Tensor) -> None:
     times = np.arange(0, 4 * 10**9, 4 * 10**6)
-    truth = Trajectory(10**9 * np.arange(8), random_poses).interpolate(times)
-    truth = Trajectory(times, truth)
+    truth = Trajectory(times, Trajectory(10**9 * np.arange(8), random_poses).interpolate(times))
     noisy = perturb(truth, rotation_degrees=2.0, translation=0.05, correlation_time=0.25, seed=3)
     error = homogeneous(truth.camera_to_worlds).inverse() @ homogeneous(noisy.camera_to_worlds)
     angles = Rotation.from_matrix(error[:, :3, :3].numpy()).magnitude()

@@ -69,9 +69,7 @@ def assert_same(first: EventPairs, second: EventPairs) -> None:
         assert np.array_equal(getattr(first, field.name), getattr(second, field.name)), field.name
 
 
-def test_pairs_in_file_equal_those_in_memory(
-    data: Path, reads: list[Path], monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest
-) -> None:
+def test_pairs_in_file_equal_those_in_memory(data: Path, reads: list[Path], request: pytest.FixtureRequest) -> None:
     in_memory = opened(data)
     assert len(in_memory.pairs) > 100
     assert not (data / KEPT).exists()
