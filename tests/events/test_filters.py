@@ -12,7 +12,6 @@ from hypothesis import strategies as st
 from aenerf_ns.camera.intrinsics import CameraIntrinsics
 from aenerf_ns.events.filters import EventFilters, EventSelection, count_events, find_hot_pixels
 from aenerf_ns.events.pairing import pair_events
-from aenerf_ns.events.stream import EventStream
 from aenerf_ns.files.event_reader import EventFile
 
 WIDTH, HEIGHT = 6, 5
@@ -156,7 +155,6 @@ def test_a_cropped_camera_sees_the_same_directions() -> None:
 
 
 def test_events_are_counted_on_a_sensor_of_more_pixels_than_16_bits_hold() -> None:
-    x, y = np.array([1279, 3, 1279], np.uint16), np.array([719, 700, 719], np.uint16)
-    events = EventStream(x, y, np.arange(3), np.ones(3, np.int8), 1280, 720)
+    events = make_stream([(1279, 719, 0, 1), (3, 700, 1, 1), (1279, 719, 2, 1)], 1280, 720)
     counts = count_events([events, events], 720, 1280)
     assert (counts[719, 1279], counts[700, 3], counts.sum()) == (4, 2, 6)

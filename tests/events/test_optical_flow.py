@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from helpers.streams import make_stream
 
 from aenerf_ns.events.optical_flow import optical_flow
 from aenerf_ns.events.stream import EventStream
@@ -24,13 +25,10 @@ def moving_dots(width: int, height: int, size: float) -> EventStream:
             t = rng.uniform(0, duration, per_half)
             place = center + velocity * size * (t - duration / 2)[:, None] + rng.uniform(0, size, (per_half, 2))
             columns.append(np.column_stack([place, t * 1e9, sign]))
-    x, y, t, p = np.concatenate(columns).T
+    rows = np.concatenate(columns)
+    x, y, _, _ = rows.T
     inside = (x >= 0) & (x < width) & (y >= 0) & (y < height) & ((x < width / 2) == (np.arange(len(x)) // 1600 < 1))
-    order = np.argsort(t[inside], kind="stable")
-    x, y, t, p = (values[inside][order] for values in (x, y, t, p))
-    return EventStream(
-        x.astype(np.uint16), y.astype(np.uint16), t.astype(np.int64), p.astype(np.int8), width, height, "dots"
-    )
+    return make_stream(sorted(rows[inside].tolist(), key=lambda row: row[2]), width, height)
 
 
 @pytest.mark.parametrize(("width", "height", "binning"), [(96, 64, 1), (288, 192, 2)])

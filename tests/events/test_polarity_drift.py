@@ -13,7 +13,6 @@ from aenerf_ns.events.pair_store import EventPairs
 from aenerf_ns.events.pairing import pair_events
 from aenerf_ns.events.polarity_drift import polarity_drift
 from aenerf_ns.events.sensor import SensorModel
-from aenerf_ns.events.stream import EventStream
 from aenerf_ns.simulator.esim import EventSimulator
 from aenerf_ns.simulator.options import SensorNoise
 
@@ -68,12 +67,9 @@ def test_hot_pixels_neither_count_nor_keep_their_surplus() -> None:
     pairs, simulator = record(SensorNoise(contrast_threshold_spread=0.03, hot_pixel_fraction=0.003, hot_pixel_rate=1e3))
     events = pairs.events()
     times = np.arange(1, 3001, dtype=np.int64) * 1_300_000
-    hot = EventStream(
-        np.full(3000, 7, np.uint16), np.full(3000, 5, np.uint16), times, np.ones(3000, np.int8), WIDTH, HEIGHT
-    )
-    columns = [np.concatenate([getattr(events, name), getattr(hot, name)]) for name in ("x", "y", "t", "p")]
-    order = np.argsort(columns[2], kind="stable")
-    found = polarity_drift(pair_events([EventStream(*(column[order] for column in columns), WIDTH, HEIGHT)]))
+    hot = np.stack(np.broadcast_arrays(7, 5, times, 1), 1)
+    rows = np.concatenate([np.stack([events.x, events.y, events.t, events.p], 1), hot])
+    found = polarity_drift(pair_events([make_stream(rows[np.argsort(rows[:, 2], kind="stable")], WIDTH, HEIGHT)]))
     assert found.spread == pytest.approx(true_drift(simulator).std(), rel=0.1)
     assert found.drift[5, 7] > 0.9
 

@@ -6,10 +6,9 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from helpers.streams import random_stream
+from helpers.streams import make_stream, random_stream
 
 from aenerf_ns.events.statistics import event_statistics
-from aenerf_ns.events.stream import EventStream
 
 
 def test_statistics_are_those_of_brute_force_however_the_stream_is_cut() -> None:
@@ -39,8 +38,7 @@ def test_statistics_are_those_of_brute_force_however_the_stream_is_cut() -> None
 def test_the_sample_of_pairs_is_even_and_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("aenerf_ns.events.statistics._MAX_PAIRS", 8)
     n = 1000
-    zeros = np.zeros(n, np.uint16)
-    events = EventStream(zeros, zeros, np.arange(n), np.ones(n, np.int8), 1, 1)
+    events = make_stream([(0, 0, t, 1) for t in range(n)], 1, 1)
     found = event_statistics([events[:300], events[300:]], 1, 1, (0, n - 1), 4)
     steps = np.diff(found.pair_times[:, 0])
     assert 8 <= len(found.pair_times) <= 16

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 from hypothesis import strategies as st
+from numpy.typing import ArrayLike
 
 from aenerf_ns.events.stream import EventStream
 from aenerf_ns.files.event_reader import EventFile
@@ -16,7 +17,7 @@ FUZZ_EXAMPLES = int(os.environ.get("AENERF_FUZZ_EXAMPLES", "60"))
 """Examples of each test that feeds readers with damaged and random input; many more when they are set to."""
 
 
-def make_stream(rows: list[tuple[int, int, int, int]], width: int = 4, height: int = 3) -> EventStream:
+def make_stream(rows: ArrayLike, width: int = 4, height: int = 3) -> EventStream:
     """A stream of (x, y, t, p) rows."""
     x, y, t, p = np.array(rows, dtype=np.int64).reshape(-1, 4).T
     return EventStream(

@@ -9,9 +9,10 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from helpers.small_datasets import END, START, write_native
+from helpers.small_datasets import END, START
 from helpers.small_pipelines import make_pipeline, make_pipeline_config
 from helpers.small_trainings import train_small_model
+from helpers.streams import make_stream
 from nerfstudio.utils.eval_utils import eval_setup
 
 from aenerf_ns.camera.intrinsics import CameraIntrinsics
@@ -19,7 +20,6 @@ from aenerf_ns.camera.rotation import rotation_from_vector
 from aenerf_ns.camera.trajectory import Trajectory
 from aenerf_ns.evaluation.pose_diagnosis import diagnose, summarize
 from aenerf_ns.events.sensor import SensorModel
-from aenerf_ns.events.stream import EventStream
 from aenerf_ns.recording.writer import NativeDatasetWriter
 from aenerf_ns.supervision.base import LossCoefficients, SamplerConfig, SupervisionConfig
 from aenerf_ns.supervision.peers.frames import FrameSampler, FrameSupervision
@@ -48,8 +48,7 @@ def write_dots(folder: Path, speed: float = 1.0) -> None:
     if speed == 0:
         # Noise alone.
         step, dot = np.repeat(np.arange(1, 1001), 10), rng.choice(inside[0].nonzero()[0], 10_000)
-    columns = (x[step, dot].astype(np.uint16), y[step, dot].astype(np.uint16), times[step])
-    events = EventStream(*columns, polarity[dot].astype(np.int8), 64, 48)
+    events = make_stream(np.stack([x[step, dot], y[step, dot], times[step], polarity[dot]], 1), 64, 48)
     with NativeDatasetWriter(folder, CAMERA, SensorModel(), "srgb") as writer:
         writer.events.append(events)
         writer.add_trajectories(Trajectory(times, poses), None)
@@ -124,13 +123,13 @@ def test_still_camera_and_few_events_can_be_diagnosed(tmp_path: Path, mode: str)
         json.dumps(figures, allow_nan=False)
 
 
-def test_a_method_that_reads_no_events_is_diagnosed_without_them(tmp_path: Path) -> None:
-    config = make_pipeline_config(write_native(tmp_path / "data"), pose_correction="spline")
+def test_a_method_that_reads_no_events_is_diagnosed_without_them(native: Path) -> None:
+    config = make_pipeline_config(native, pose_correction="spline")
     config.datamanager.dataparser.start_time_ns, config.datamanager.dataparser.end_time_ns = START, END
     config.datamanager.sampler = SamplerConfig(_target=FrameSampler)
     config.model.supervision = SupervisionConfig(_target=FrameSupervision)
     config.model.loss_coefficients = LossCoefficients()
-    (tmp_path / "data" / "events.h5").unlink()
+    (native / "events.h5").unlink()
     figures = diagnosed(config.setup(device="cpu", test_mode="val"))
     assert figures["contrast_corrected"] is None
     assert figures["stretches"] == []
