@@ -101,15 +101,8 @@ class EventPairs:
         positive, negative = own_counts(packed, earlier)
         kept = is_pair(packed) & (positive != negative)
         order = np.flatnonzero(kept)[np.argsort(times[kept], kind="stable")]
-        y, x = np.divmod(pixel_index(packed[order]), self.width)
-        return EventStream(
-            x=x.astype(np.uint16),
-            y=y.astype(np.uint16),
-            t=times[order],
-            p=np.where(positive > negative, 1, -1).astype(np.int8)[order],
-            width=self.width,
-            height=self.height,
-        )
+        is_positive = (positive > negative)[order]
+        return EventStream.at_pixels(pixel_index(packed[order]), times[order], is_positive, self.width, self.height)
 
     def summary(self) -> str:
         """Return one line that accounts for every event of the stream."""

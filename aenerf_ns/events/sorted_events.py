@@ -60,15 +60,7 @@ class SortedEvents:
     def events(self, part: slice = slice(None)) -> EventStream:
         """Return the events of a slice, in the order of time."""
         codes = self.codes[part]
-        rows, columns = np.divmod(codes >> 1, np.uint32(self.width))
-        return EventStream(
-            x=columns.astype(np.uint16),
-            y=rows.astype(np.uint16),
-            t=self.times[part],
-            p=np.where(codes & 1, -1, 1).astype(np.int8),
-            width=self.width,
-            height=self.height,
-        )
+        return EventStream.at_pixels(codes >> 1, self.times[part], codes & 1 == 0, self.width, self.height)
 
     def summary(self) -> str:
         """Return one line that accounts for every event of the stream."""

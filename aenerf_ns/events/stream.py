@@ -96,6 +96,15 @@ class EventStream:
         columns = {name: np.concatenate([getattr(part, name) for part in parts]) for name in _COLUMNS}
         return replace(parts[0], **columns)
 
+    @staticmethod
+    def at_pixels(
+        pixels: NDArray[np.integer], t: NDArray[np.int64], is_positive: NDArray[np.bool_], width: int, height: int
+    ) -> EventStream:
+        """Return the events at (N,) pixels, counted row by row over the sensor, and times in nanoseconds."""
+        y, x = np.divmod(pixels, width)
+        p = np.where(is_positive, 1, -1)
+        return EventStream(x.astype(np.uint16), y.astype(np.uint16), t, p.astype(np.int8), width, height)
+
     def require_size_of(self, usable: NDArray[np.bool_]) -> None:
         """Raise a DataError if the sensor does not have the size of (height, width) pixels of a lens model."""
         height, width = usable.shape
