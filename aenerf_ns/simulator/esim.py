@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from aenerf_ns.camera.image_encoding import LUMINANCE
 from aenerf_ns.events.sensor import SensorModel
+from aenerf_ns.events.stream import EventStream
 from aenerf_ns.simulator.options import MIN_CONTRAST_THRESHOLD, SensorNoise
 
 # Both from v2e (Hu et al., CVPRW 2021): the part of the shot noise that vanishes at white, and the radiance that a dark
@@ -24,8 +25,6 @@ _BRIGHT_REDUCTION = 0.75
 _DARK_RADIANCE = 20 / 255
 
 NOISELESS = SensorNoise()
-
-Events = tuple[NDArray[np.uint16], NDArray[np.uint16], NDArray[np.int64], NDArray[np.int8]]
 
 
 @numba.njit(cache=True)
@@ -181,10 +180,10 @@ class EventSimulator:
 
         >>> simulator = EventSimulator(1, 1, SensorModel(0.25, 0.25))
         >>> events = simulator([[0.1]], 0)
-        >>> x, y, t, p = simulator([[0.2]], 1_000_000)
-        >>> p
+        >>> events = simulator([[0.2]], 1_000_000)
+        >>> events.p
         array([1, 1], dtype=int8)
-        >>> t
+        >>> events.t
         array([363275, 726549])
     """
 
@@ -226,7 +225,7 @@ class EventSimulator:
         # Of the light that the bandwidth follows: the mean over the pixels, summed over the nanoseconds.
         self._sum_of_light = 0.0
 
-    def __call__(self, image: ArrayLike, time_ns: int) -> Events:
+    def __call__(self, image: ArrayLike, time_ns: int) -> EventStream:
         """Show the sensor the next frame.
 
         Args:
@@ -235,9 +234,8 @@ class EventSimulator:
             time_ns: time of the frame in nanoseconds, later than the previous frame's.
 
         Returns:
-            x (N,) uint16, y (N,) uint16, t (N,) int64 in nanoseconds, p (N,) int8 of +1 or -1: the events in
-            (previous frame, this frame], ordered by time, then by pixel unless they wait or share a tick. The
-            first frame gives no events. A readout may delay events beyond this frame, and the clock rounds down.
+            The events in (previous frame, this frame], ordered by time, then by pixel unless they wait or share a tick.
+            The first frame gives no events. A readout may delay events beyond this frame, and the clock rounds down.
 
         Raises:
             ValueError: a wrong shape, a negative or non-finite radiance, or a time that does not increase.
@@ -285,9 +283,8 @@ class EventSimulator:
             is_read = delayed >= 0
             self.num_lost_events += len(t) - np.count_nonzero(is_read)
             t, pixels, p = self._start_ns + delayed[is_read].astype(np.int64), pixels[is_read], p[is_read]
-        y, x = np.divmod(pixels, self.width)
         self._last, self._time_ns = (intensity, log_intensity, filtered, signal), time_ns
-        return x.astype(np.uint16), y.astype(np.uint16), t - t % self._tick, p.astype(np.int8)
+        return EventStream.at_pixels(pixels, t - t % self._tick, p > 0, self.width, self.height)
 
     def recorded_sensor(self) -> SensorModel:
         """Return the sensor, with the bandwidth that a pixel has at the mean radiance of the frames."""

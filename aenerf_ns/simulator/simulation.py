@@ -92,10 +92,9 @@ class Simulation:
 
     def events(self) -> Iterator[EventStream]:
         """Render the path densely and yield the events of each frame interval. Call it once."""
-        camera = self._camera
         for parameter, time in zip(track(self._frames, "Simulating events"), self._times, strict=True):
             image = self._render(self._scene.path(float(parameter)), RAYS_PER_PIXEL)[0]
-            yield EventStream(*self.simulator(image, int(time)), camera.width, camera.height, "simulation")
+            yield self.simulator(image, int(time))
 
     def frame_times(self, frame_rate: float, exposure: float) -> NDArray[np.int64]:
         """Return the middles of the exposures of a camera that takes frames along the path, in nanoseconds.

@@ -79,8 +79,7 @@ def video_events(
                 radiance = np.maximum(np.exp(log_between) - epsilon, 0)
                 pieces.append(simulator(radiance, start + round(fraction * (time - start))))
         pieces.append(simulator(seen, time))
-        x, y, t, p = (np.concatenate(column) for column in zip(*pieces, strict=True))
-        yield VideoInterval(frame, time, EventStream(x, y, t, p, video.width, video.height, video.source))
+        yield VideoInterval(frame, time, EventStream.concatenate(pieces))
         before = frame, seen, time
 
 

@@ -29,12 +29,12 @@ def test_frames_tell_the_bandwidth(tmp_path: Path, bandwidth: float | None) -> N
     texture = cv2.resize(coarse, (200, HEIGHT))
     sensor = SensorModel(0.1, 0.1, 100_000)
     simulator = EventSimulator(WIDTH, HEIGHT, sensor, SensorNoise(bandwidth=bandwidth))
-    columns, frames = [], []
+    parts, frames = [], []
     for millisecond in range(600):
         shift = abs(300 - millisecond) / 4
         positions = np.arange(WIDTH) + shift
         picture = np.exp([np.interp(positions, np.arange(200), row) for row in texture])
-        columns.append(simulator(picture, 1_000_000 * millisecond))
+        parts.append(simulator(picture, 1_000_000 * millisecond))
         if millisecond % 40 == 30:
             levels = np.searchsorted(decode((np.arange(255) + 0.5) / 255, "srgb"), picture).astype(np.uint8)
             frames.append((1_000_000 * millisecond, tmp_path / f"{millisecond}.png"))
@@ -42,7 +42,7 @@ def test_frames_tell_the_bandwidth(tmp_path: Path, bandwidth: float | None) -> N
     camera = CameraIntrinsics(WIDTH, HEIGHT, 40.0, 40.0, 20.0, 15.0)
     capture = SimpleNamespace(sensor=sensor, event_camera=camera, has_own_frames=True, image_encoding="srgb")
     changes = FrameChanges(capture, frames, TimeWindow())
-    events = EventStream(*map(np.concatenate, zip(*columns, strict=True)), WIDTH, HEIGHT)
+    events = EventStream.concatenate(parts)
     for chunk in (events[:3000], events[3000:]):
         changes.add(chunk, np.ones(len(chunk)))
     found = changes.bandwidth(1.0)

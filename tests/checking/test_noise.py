@@ -7,7 +7,6 @@ import pytest
 
 from aenerf_ns.checking.noise import NoiseRate
 from aenerf_ns.events.sensor import SensorModel
-from aenerf_ns.events.stream import EventStream
 from aenerf_ns.simulator.esim import EventSimulator
 from aenerf_ns.simulator.options import SensorNoise
 
@@ -20,7 +19,7 @@ def noise_rate(noise: SensorNoise) -> float | None:
     columns = np.broadcast_to(np.arange(WIDTH), (HEIGHT, WIDTH))
     for index in range(601):
         image = 0.02 + 0.1 * (columns < index % WIDTH)
-        rate.add(EventStream(*simulator(image, 10_000_000 * index), WIDTH, HEIGHT))
+        rate.add(simulator(image, 10_000_000 * index))
     is_hot = np.zeros((HEIGHT, WIDTH), bool)
     is_hot[0, 0] = True
     return rate.rate(is_hot)

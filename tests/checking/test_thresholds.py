@@ -30,7 +30,7 @@ def test_balance_gives_the_ratio(thresholds: tuple[float, float], name: str) -> 
     simulator = EventSimulator(WIDTH, HEIGHT, SensorModel(*thresholds, model.refractory_period), noise)
     # 2 s of light that changes at random within a factor of 7 every 10 ms.
     light = np.exp(np.random.default_rng(0).uniform(-2, 0, (201, HEIGHT, WIDTH)))
-    parts = [EventStream(*simulator(image, 10_000_000 * index), WIDTH, HEIGHT) for index, image in enumerate(light)]
+    parts = [simulator(image, 10_000_000 * index) for index, image in enumerate(light)]
     ratio, uncertainty = ratio_of(EventStream.concatenate(parts), model.refractory_period)
     truth = thresholds[0] / thresholds[1]
     assert abs(ratio - truth) < uncertainty < 0.05 * truth

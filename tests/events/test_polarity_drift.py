@@ -27,13 +27,12 @@ def record(noise: SensorNoise, num_frames: int = 400) -> tuple[EventPairs, Event
     waves = rng.normal(0, 0.25, (12, 2))
     phases, strengths = rng.uniform(0, 6, 12), rng.uniform(0.1, 0.4, 12)
     y, x = np.indices((HEIGHT, WIDTH))
-    columns: list[list[np.ndarray]] = [[], [], [], []]
+    parts = []
     for frame in range(num_frames):
         angles = waves[:, :1, None] * (x + 0.7 * frame) + waves[:, 1:, None] * (y + 0.3 * frame) + phases[:, None, None]
         radiance = 0.2 * np.exp((strengths[:, None, None] * np.sin(angles)).sum(0))
-        for column, values in zip(columns, simulator(radiance, 10_000_000 * frame), strict=True):
-            column.append(values)
-    return pair_events([EventStream(*map(np.concatenate, columns), WIDTH, HEIGHT)]), simulator  # type: ignore[arg-type]
+        parts.append(simulator(radiance, 10_000_000 * frame))
+    return pair_events(parts), simulator
 
 
 def true_drift(simulator: EventSimulator) -> np.ndarray:

@@ -32,7 +32,7 @@ def slide(threshold: float) -> Capture:
     pieces = []
     for moved in np.arange(0, LENGTH, STEP):
         frame = cv2.warpAffine(texture, np.array([[1, 0, -moved], [0, 1, 0]]), (WIDTH, HEIGHT))
-        pieces.append(EventStream(*simulator(frame, round(moved * 1e6)), WIDTH, HEIGHT, "made"))
+        pieces.append(simulator(frame, round(moved * 1e6)))
     camera = CameraIntrinsics(WIDTH, HEIGHT, 60.0, 60.0, WIDTH / 2, HEIGHT / 2)
     return Capture(EventsInMemory(EventStream.concatenate(pieces)), camera, sensor, camera, "linear")
 

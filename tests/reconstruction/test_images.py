@@ -34,7 +34,7 @@ def radiance(index: int) -> NDArray[np.float64]:
 def events() -> Iterator[EventStream]:
     simulator = EventSimulator(SIZE, SIZE, SENSOR)
     for index in range(NUM_FRAMES):
-        yield EventStream(*simulator(radiance(index), index * STEP), SIZE, SIZE)
+        yield simulator(radiance(index), index * STEP)
 
 
 def test_images_are_those_of_the_light() -> None:

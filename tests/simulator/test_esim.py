@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from aenerf_ns.events.sensor import BayerPattern, SensorModel
+from aenerf_ns.events.stream import EventStream
 from aenerf_ns.simulator.esim import EventSimulator
 from aenerf_ns.simulator.options import SENSORS, SensorName, SensorNoise
 
@@ -31,8 +32,8 @@ def make_simulator(
 
 
 def simulate(simulator: EventSimulator, images: np.ndarray, times: np.ndarray) -> tuple[np.ndarray, ...]:
-    parts = [simulator(image, int(time)) for image, time in zip(images, times, strict=True)]
-    return tuple(np.concatenate(column) for column in zip(*parts, strict=True))
+    events = EventStream.concatenate([simulator(image, int(time)) for image, time in zip(images, times, strict=True)])
+    return events.x, events.y, events.t, events.p
 
 
 def to_images(log_frames: np.ndarray) -> np.ndarray:
@@ -103,7 +104,7 @@ def test_initial_reference_times_fill_the_refractory_period() -> None:
     simulator = make_simulator(0.1, 0.1, 60, 50, refractory_period=1_000_000)
     simulator(np.ones((50, 60)), 0)
     # A steady rise of one threshold each 2 ms: a pixel fires exactly 2 ms after it took its reference.
-    _, _, t, _ = simulator(np.exp(0.5) * (1 + LOG_EPSILON) * np.ones((50, 60)) - LOG_EPSILON, 10_000_000)
+    t = simulator(np.exp(0.5) * (1 + LOG_EPSILON) * np.ones((50, 60)) - LOG_EPSILON, 10_000_000).t
     first = np.sort(t)[:3000] - 2_000_000
     assert 0 <= first.min() < 10_000
     assert 990_000 < first.max() < 1_000_000
@@ -114,12 +115,12 @@ def test_stream_order_and_range() -> None:
     rng = np.random.default_rng(3)
     simulator = make_simulator(0.01, 0.01)
     simulator(rng.uniform(0, 1, (HEIGHT, WIDTH)), 0)
-    x, y, t, _ = simulator(rng.uniform(0, 1, (HEIGHT, WIDTH)), 50)  # far more events than time stamps
-    assert len(t) > 1000
-    assert t.min() > 0
-    assert t.max() <= 50
-    pixel = y.astype(np.int64) * WIDTH + x
-    np.testing.assert_array_equal(np.lexsort((pixel, t)), np.arange(len(t)))
+    events = simulator(rng.uniform(0, 1, (HEIGHT, WIDTH)), 50)  # far more events than time stamps
+    assert len(events) > 1000
+    assert events.t.min() > 0
+    assert events.t.max() <= 50
+    pixel = events.y.astype(np.int64) * WIDTH + events.x
+    np.testing.assert_array_equal(np.lexsort((pixel, events.t)), np.arange(len(events)))
 
 
 def test_color_filters_and_luminance() -> None:
@@ -131,9 +132,9 @@ def test_color_filters_and_luminance() -> None:
         after[..., channel] = 1.3
         color = make_simulator(0.2, 0.2, 6, 4, bayer_pattern="RGGB")
         color(before, 0)
-        x, y, _, _ = color(after, 1000)
-        assert sorted(set(zip((y % 2).tolist(), (x % 2).tolist(), strict=True))) == pixels
-        assert len(x) == 6 * len(pixels)
+        events = color(after, 1000)
+        assert sorted(set(zip((events.y % 2).tolist(), (events.x % 2).tolist(), strict=True))) == pixels
+        assert len(events) == 6 * len(pixels)
     gray, luminance = make_simulator(0.2, 0.2, 6, 4), make_simulator(0.2, 0.2, 6, 4)
     rgb = np.random.default_rng(0).uniform(0, 3, (2, 4, 6, 3))
     weights = np.array([0.2126, 0.7152, 0.0722])
@@ -340,4 +341,4 @@ def test_refuse_frame() -> None:
     with pytest.raises(ValueError, match=r"shape \(6, 7, 3\), got \(6, 7\)"):
         make_simulator(0.2, 0.2, bayer_pattern="RGGB")(good, 0)
     # A refused frame leaves no trace.
-    assert len(simulator(good, 7)[0]) == 0
+    assert len(simulator(good, 7)) == 0

@@ -130,10 +130,7 @@ def test_flow_is_nearer_to_truth() -> None:
         return moving(3.3 * frame, 1.2 * frame)
 
     truth = EventStream.concatenate(
-        [
-            EventStream(*exact(seen(step / steps), round(step * FRAME / steps)), 96, 72)
-            for step in range(intervals * steps + 1)
-        ]
+        [exact(seen(step / steps), round(step * FRAME / steps)) for step in range(intervals * steps + 1)]
     )
     frames = [
         gray((encode(torch.from_numpy(seen(index)), "srgb") * 255).round().numpy()) for index in range(intervals + 1)

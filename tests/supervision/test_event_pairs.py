@@ -136,11 +136,11 @@ def test_the_lag_of_a_slow_pixel_is_allowed_for(random_poses: torch.Tensor, refr
     given = SensorModel(0.05, 0.04, refractory_period)
     simulator = EventSimulator(CAMERA.width, CAMERA.height, given, SensorNoise(bandwidth=100), log_epsilon=0.0)
     picture = np.ones((CAMERA.height, CAMERA.width))
-    columns = []
+    parts = []
     for seconds in np.arange(0, 1, 1e-3):
         picture[1, 3] = np.exp(log_radiance(seconds))
-        columns.append(simulator(picture, EPOCH + round(1e9 * seconds)))
-    stream = EventStream(*map(np.concatenate, zip(*columns, strict=True)), CAMERA.width, CAMERA.height)
+        parts.append(simulator(picture, EPOCH + round(1e9 * seconds)))
+    stream = EventStream.concatenate(parts)
     assert set(stream.x.tolist()) == {3}
     sensor = replace(given, bandwidth=100 * (mean + 20 / 255) / (1 + 20 / 255))
     torch.manual_seed(0)
