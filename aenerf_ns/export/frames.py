@@ -9,7 +9,6 @@ import torch
 from PIL import Image
 from torch import Tensor
 
-from aenerf_ns.camera.trajectory import homogeneous
 from aenerf_ns.evaluation.run import TrainedRun
 from aenerf_ns.evaluation.view_metrics import to_image
 from aenerf_ns.export.camera_model_files import IMAGE_FOLDER, PlacedImage, write_cameras
@@ -41,7 +40,7 @@ def export_frames(run: TrainedRun, folder: Path, times: Tensor, num_points: int)
     directions, usable = camera.pixel_directions()
     # Factors from distances along the ray to distances along the optical axis, which looks along -z.
     along_axis = torch.from_numpy(np.where(usable[..., None], -directions[..., 2:], 0))
-    poses = homogeneous(corrected_poses(run, times))
+    poses = corrected_poses(run, times)
     for name in (IMAGE_FOLDER, DEPTH_FOLDER):
         (folder / name).mkdir(parents=True)
     images, lines, num_far = [], [], 0

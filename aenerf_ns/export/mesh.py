@@ -8,7 +8,6 @@ import trimesh
 from numpy.typing import NDArray
 
 from aenerf_ns.camera.intrinsics import CameraIntrinsics
-from aenerf_ns.camera.trajectory import homogeneous
 from aenerf_ns.errors import DataError
 from aenerf_ns.evaluation.run import TrainedRun
 from aenerf_ns.export.rendering import corrected_poses, render
@@ -47,7 +46,7 @@ def extract_mesh(run: TrainedRun, num_views: int, resolution: int) -> trimesh.Tr
     open3d = load_open3d()
     given = run.recording.event_camera
     camera = CameraIntrinsics(given.width, given.height, given.fx, given.fy, given.cx, given.cy)
-    poses = homogeneous(corrected_poses(run, spread_times(run.scene.window, num_views)))
+    poses = corrected_poses(run, spread_times(run.scene.window, num_views))
     colors, distances = [], []
     for pose in track(poses, "Rendering views"):
         outputs = render(run, camera, pose)

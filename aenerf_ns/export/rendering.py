@@ -70,7 +70,7 @@ def _place_poses(run: TrainedRun, views: list[ReferenceView]) -> Tensor:
             if correction.has_ground_truth:
                 # From the units of the true trajectory to those of the corrected poses.
                 on_rig[:3, 3] *= alignment.scale
-            poses.append(homogeneous(corrected_poses(run, torch.tensor([view.time])))[0] @ on_rig)
+            poses.append(corrected_poses(run, torch.tensor([view.time]))[0] @ on_rig)
         else:
             poses.append(homogeneous(alignment(view.camera_to_world[:3])))
     return torch.stack(poses)
@@ -78,10 +78,10 @@ def _place_poses(run: TrainedRun, views: list[ReferenceView]) -> Tensor:
 
 @torch.no_grad()
 def corrected_poses(run: TrainedRun, times: Tensor) -> Tensor:
-    """Compute the corrected poses (N, 3, 4) at (N,) times in nanoseconds: OpenCV axes, in the recording's world."""
+    """Compute the corrected poses (N, 4, 4) at (N,) times in nanoseconds: OpenCV axes, in the recording's world."""
     correction = run.model.camera_optimizer
     seconds = correction.trajectory.seconds(times.to(run.device))
-    return run.scene.to_recording(correction.pose(seconds))
+    return homogeneous(run.scene.to_recording(correction.pose(seconds)))
 
 
 def _make_cameras(run: TrainedRun, camera: CameraIntrinsics, poses: Tensor) -> Cameras:

@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 from torch import Tensor
 
-from aenerf_ns.camera.trajectory import homogeneous
 from aenerf_ns.evaluation.run import TrainedRun
 from aenerf_ns.evaluation.view_metrics import to_image
 from aenerf_ns.events.picture import net_picture
@@ -39,7 +38,7 @@ def render_panels(run: TrainedRun, times: Tensor) -> Iterator[NDArray[np.uint8]]
     camera = recording.event_camera
     trigger = RenderedEvents(recording.sensor, camera.width, camera.height)
     images = [(time, file) for time, file in recording.frames if file.is_file()]
-    poses = homogeneous(corrected_poses(run, times))
+    poses = corrected_poses(run, times)
     trigger(render(run, camera, poses[0])["log_radiance"].cpu().numpy())
     recorded = sum_recorded_events(recording.event_file, times.numpy())
     depth_range: tuple[float, float] | None = None

@@ -51,7 +51,7 @@ def test_place_images_at_corrected_poses(run: TrainedRun) -> None:
     corrected = corrected_poses(run, torch.tensor([SECOND // 4]))[0]
     rig = homogeneous(recording.trajectory.interpolate(SECOND // 4))
     on_rig = np.linalg.inv(rig) @ given[0].camera_to_world.numpy()
-    np.testing.assert_allclose(timed, homogeneous(corrected).numpy() @ on_rig, atol=1e-9)
+    np.testing.assert_allclose(timed, corrected.numpy() @ on_rig, atol=1e-9)
     # As the evaluation places it: renderings from there are compared with the image.
     cameras = run.read_reference_views("test").cameras
     expected = run.scene.to_recording(run.model.camera_optimizer.apply_to_camera(cameras).double())
