@@ -6,7 +6,7 @@ import numpy as np
 import torch
 
 from aenerf_ns.camera.intrinsics import CameraIntrinsics
-from aenerf_ns.camera.trajectory import Trajectory, homogeneous
+from aenerf_ns.camera.trajectory import Trajectory
 from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.events.stream import EventStream
 from aenerf_ns.recording.writer import NativeDatasetWriter
@@ -34,5 +34,5 @@ with NativeDatasetWriter(Path("scene_from_writer"), camera, sensor, image_encodi
     writer.events.append(events)  # as often as you like, in the order of time
     picture = np.full((height, width, 3), 100, np.uint8)
     time = start + 500_000_001
-    writer.add_image("val", picture, homogeneous(trajectory.interpolate(time)), time)
-    writer.add_image("test", picture, homogeneous(trajectory.camera_to_worlds[7]))
+    writer.add_image("val", picture, trajectory.interpolate(time), time)
+    writer.add_image("test", picture, trajectory.camera_to_worlds[7])

@@ -92,8 +92,6 @@ class Reconstruct(DatasetCommand):
         self, recording: Recording, source: ImageSource, writer: NativeDatasetWriter
     ) -> Iterator[NDArray[np.uint8]]:
         """Write the events and an image of each batch of them that ends at a time with a pose. Yield the images."""
-        from aenerf_ns.camera.trajectory import homogeneous
-
         # The views of a dataset are in the world of its true poses where it has these, whatever poses are trained on.
         events, reference = recording.event_file, recording.reference_trajectory
         known = recording.trajectory.known_time(recording.max_pose_gap)
@@ -110,7 +108,7 @@ class Reconstruct(DatasetCommand):
             time -= recording.sensor.image_lag
             if known.contains(time) and reference.start <= time <= reference.end:
                 num_posed += 1
-                writer.add_image("train", image, homogeneous(reference.interpolate(time)), time)
+                writer.add_image("train", image, reference.interpolate(time), time)
                 yield image
         if num_posed == 0:
             problem = f"its events make {num_images} images of {num_events} events each, none at a time with a pose"

@@ -164,7 +164,6 @@ class SimulateVideo(SimulationCommand):
 
     def _write_dataset(self, lock: OutputLock, video: Video, simulator: EventSimulator, poses: _VideoPoses) -> str:
         """Write a dataset folder, and describe it in one line."""
-        from aenerf_ns.camera.trajectory import homogeneous
         from aenerf_ns.recording.recording import Split
         from aenerf_ns.recording.views import spread_evenly
         from aenerf_ns.recording.writer import NativeDatasetWriter
@@ -187,7 +186,7 @@ class SimulateVideo(SimulationCommand):
             for frame, time, _ in self._write_events(writer, video, simulator):
                 for split, times in chosen.items():
                     if time in times:
-                        writer.add_image(split, frame, homogeneous(reference.interpolate(time)), time)
+                        writer.add_image(split, frame, reference.interpolate(time), time)
         counts = ", ".join(f"{len(times)} {split}" for split, times in chosen.items())
         return (
             f"{self.output}: {writer.events.num_events:,} events of {len(video.times)} frames, "

@@ -18,7 +18,7 @@ from torch import Tensor
 
 from aenerf_ns.camera.image_encoding import ImageEncoding
 from aenerf_ns.camera.intrinsics import CameraIntrinsics
-from aenerf_ns.camera.trajectory import OPENCV_TO_OPENGL, Trajectory
+from aenerf_ns.camera.trajectory import OPENCV_TO_OPENGL, Trajectory, homogeneous
 from aenerf_ns.errors import DataError, reason
 from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.files.event_hdf5 import Hdf5EventWriter
@@ -187,7 +187,7 @@ class NativeDatasetWriter(_FolderWriter):
         Args:
             split: the split that the image belongs to.
             image: (height, width, 3) display values.
-            camera_to_world: (4, 4) pose, OpenCV camera axes.
+            camera_to_world: (3, 4) or (4, 4) pose, OpenCV camera axes.
             time: nanoseconds at which the image was taken on the trajectory, or None.
             linear: (height, width, 3) the same image in linear radiance; 65535 is display white.
             depth: (height, width) along the optical axis, in the unit of the poses' lengths; not finite where it is
@@ -240,7 +240,7 @@ class NativeDatasetWriter(_FolderWriter):
         (self._partial / name).parent.mkdir(parents=True, exist_ok=True)
         frame: dict[str, Any] = {
             "file_path": name,
-            "transform_matrix": (camera_to_world.double() @ OPENCV_TO_OPENGL).tolist(),
+            "transform_matrix": (homogeneous(camera_to_world[:3].double()) @ OPENCV_TO_OPENGL).tolist(),
         }
         if time is not None:
             frame["timestamp"] = format_seconds(time)

@@ -10,7 +10,7 @@ from nerfstudio.data.dataparsers.base_dataparser import DataParserConfig, Datapa
 from PIL import Image
 
 from aenerf_ns.camera.intrinsics import CameraIntrinsics
-from aenerf_ns.camera.trajectory import Trajectory, homogeneous
+from aenerf_ns.camera.trajectory import Trajectory
 from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.recording.writer import NativeDatasetWriter
 from helpers.streams import random_stream
@@ -41,10 +41,10 @@ def write_native(folder: Path, scene_box: np.ndarray | None = None) -> Path:
         writer.add_trajectories(trajectory, trajectory)
         picture = np.full((4, 6, 3), 77, np.uint8)
         for time in (START, START + 150_000_000, END):
-            writer.add_image("train", picture, homogeneous(trajectory.interpolate(time)), time)
-        writer.add_image("val", picture, homogeneous(trajectory.camera_to_worlds[3]))
-        writer.add_image("test", picture + 1, homogeneous(trajectory.camera_to_worlds[4]))
-        writer.add_image("test", picture + 2, homogeneous(trajectory.camera_to_worlds[5]))
+            writer.add_image("train", picture, trajectory.interpolate(time), time)
+        writer.add_image("val", picture, trajectory.camera_to_worlds[3])
+        writer.add_image("test", picture + 1, trajectory.camera_to_worlds[4])
+        writer.add_image("test", picture + 2, trajectory.camera_to_worlds[5])
     return folder
 
 

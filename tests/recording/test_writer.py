@@ -15,7 +15,6 @@ import pytest
 from helpers.small_datasets import CAMERA, SENSOR, make_trajectory, write_native
 from PIL import Image
 
-from aenerf_ns.camera.trajectory import homogeneous
 from aenerf_ns.cli.convert import Convert
 from aenerf_ns.errors import DataError
 from aenerf_ns.recording.writer import NativeDatasetWriter
@@ -75,9 +74,9 @@ def write_as_simulated(folder: Path) -> None:
         writer.add_trajectories(trajectory, trajectory)
         writer.add_poses_report({})
         picture, linear = np.zeros((4, 6, 3), np.uint8), np.zeros((4, 6, 3), np.uint16)
+        pose, depth = trajectory.camera_to_worlds[0], np.ones((4, 6), np.float32)
         for split in ("train", "val", "test"):
-            pose = homogeneous(trajectory.camera_to_worlds[0])
-            writer.add_image(split, picture, pose, linear=linear, depth=np.ones((4, 6), np.float32))
+            writer.add_image(split, picture, pose, linear=linear, depth=depth)
 
 
 def test_full_disk_leaves_nothing_of_a_simulation(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
