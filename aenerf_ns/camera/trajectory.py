@@ -65,15 +65,10 @@ class Trajectory(nn.Module):
         backward = seconds.diff() <= 0
         if backward.any():
             index = int(backward.nonzero()[0]) + 1
-            is_equal = times[index] == times[index - 1]
-            raise DataError(
-                source,
-                f"pose {index} is at {int(times[index])} ns, not after the pose ahead of it at "
-                f"{int(times[index - 1])} ns",
-                "drop repeated poses, or write the times with all digits and in the right unit"
-                if is_equal
-                else "sort the poses by time",
-            )
+            ahead, time = times[index - 1 : index + 1].tolist()
+            problem = f"pose {index} is at {time} ns, not after the pose ahead of it at {ahead} ns"
+            remedy = "drop repeated poses, or write the times with all digits and in the right unit"
+            raise DataError(source, problem, remedy if time == ahead else "sort the poses by time")
         bad = ~poses.isfinite().flatten(1).all(1)
         if bad.any():
             raise DataError(source, f"pose {int(bad.nonzero()[0])} is not finite", "drop it or interpolate it")
@@ -185,12 +180,9 @@ class Trajectory(nn.Module):
         times = _as_times(times).to(self.times.device)
         outside = (times < self.start) | (times > self.end)
         if outside.any():
-            raise DataError(
-                self.source,
-                f"no pose at {int(times[outside].flatten()[0])} ns, outside the trajectory's {self.start} to "
-                f"{self.end} ns",
-                "leave out what lies outside, or give poses that cover it",
-            )
+            first = int(times[outside].flatten()[0])
+            problem = f"no pose at {first} ns, outside the trajectory's {self.start} to {self.end} ns"
+            raise DataError(self.source, problem, "leave out what lies outside, or give poses that cover it")
         return self.pose(self.seconds(times))
 
     def crop(self, start: int, end: int) -> Trajectory:
@@ -204,11 +196,8 @@ class Trajectory(nn.Module):
         first = max(int(torch.searchsorted(self.times, start, right=True)) - 1, 0)
         last = min(int(torch.searchsorted(self.times, end)), len(self) - 1)
         if start > self.end or end < self.start or first >= last:
-            raise DataError(
-                self.source,
-                f"its poses from {self.start} to {self.end} ns do not overlap the events from {start} to {end} ns",
-                "check that events and poses share one clock and one unit of time",
-            )
+            problem = f"its poses from {self.start} to {self.end} ns do not overlap the events from {start} to {end} ns"
+            raise DataError(self.source, problem, "check that events and poses share one clock and one unit of time")
         part = Trajectory(self.times[first : last + 1], self.camera_to_worlds[first : last + 1], self.source)
         part._polynomials = self._polynomials[first:last]
         return part
@@ -283,11 +272,8 @@ def require_rigid(poses: Tensor, source: str | Path) -> None:
         error = torch.maximum(error, (poses[:, 3] - poses.new_tensor([0, 0, 0, 1])).abs().amax(1))
     # Also if it is not a number.
     if not error.max() <= _MAX_RIGIDITY_ERROR:
-        raise DataError(
-            source,
-            f"pose {int(error.argmax())} is not a rigid motion (it is off by {float(error.max()):.2g})",
-            "give rotations without scale or reflection, and a last row of 0 0 0 1",
-        )
+        problem = f"pose {int(error.argmax())} is not a rigid motion (it is off by {float(error.max()):.2g})"
+        raise DataError(source, problem, "give rotations without scale or reflection, and a last row of 0 0 0 1")
 
 
 def homogeneous(poses: Tensor) -> Tensor:

@@ -126,12 +126,9 @@ class SimulateVideo(SimulationCommand):
                 raise DataError(self.calibration, "it states no focal lengths and no principal point", remedy)
             camera = calibration.event_camera
             if (camera.width, camera.height) != (video.width, video.height):
-                raise DataError(
-                    self.calibration,
-                    f"its camera has {camera.width} x {camera.height} pixels, the frames of {video.source} "
-                    f"{video.width} x {video.height}",
-                    "give the calibration of the frames as they are",
-                )
+                size = f"{camera.width} x {camera.height}"
+                problem = f"its camera has {size} pixels, the frames of {video.source} {video.width} x {video.height}"
+                raise DataError(self.calibration, problem, "give the calibration of the frames as they are")
             return camera
         if self.intrinsics is not None:
             with value_errors_as_data_error("--intrinsics", "give fl_x fl_y cx cy in pixels"):

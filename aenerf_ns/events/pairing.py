@@ -155,12 +155,9 @@ class _Table:
             self._counts,
         )
         if failed >= 0:
-            raise DataError(
-                chunk.source,
-                f"more than {_MAX_MERGED} events of one polarity at pixel ({chunk.x[failed]}, {chunk.y[failed]}) share "
-                f"the time {chunk.t[failed]} ns",
-                "check the unit of the times",
-            )
+            x, y, t = chunk.x[failed], chunk.y[failed], chunk.t[failed]
+            problem = f"more than {_MAX_MERGED} events of one polarity at pixel ({x}, {y}) share the time {t} ns"
+            raise DataError(chunk.source, problem, "check the unit of the times")
 
     def flush(self, everything: bool = False) -> None:
         """Write the events in memory to a temporary file, sorted by pixel.

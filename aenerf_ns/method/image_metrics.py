@@ -41,9 +41,8 @@ class ImageMetrics:
         """
         height, width = reference.shape[:2]
         if min(height, width) < _MIN_SIDE:
-            raise DataError(
-                "evaluation", f"images of {width} x {height} pixels", f"give {_MIN_SIDE} or more, which SSIM needs"
-            )
+            remedy = f"give {_MIN_SIDE} or more, which SSIM needs"
+            raise DataError("evaluation", f"images of {width} x {height} pixels", remedy)
         # Imported lazily: every ns-* command imports this module, and torchmetrics is slow to import.
         from torchmetrics.functional.image import peak_signal_noise_ratio, structural_similarity_index_measure
 

@@ -374,18 +374,14 @@ def _require_possible(config: AENeRFModelConfig, duration: float) -> None:
     """
     near, far = config.near_plane, config.far_plane
     if not 0 <= near < far < math.inf:
-        raise DataError(
-            "model", f"near_plane {near:g} and far_plane {far:g}", "give a finite far plane above the near one"
-        )
+        problem = f"near_plane {near:g} and far_plane {far:g}"
+        raise DataError("model", problem, "give a finite far plane above the near one")
     if config.color_correction_num_rays < 1:
         raise DataError("model", f"color_correction_num_rays {config.color_correction_num_rays}", "give thousands")
     rounds, networks = len(config.proposal.num_samples_per_ray), len(config.proposal.max_resolutions)
     if rounds == 0 or (config.backbone == "hash" and rounds != networks):
-        raise DataError(
-            "model",
-            f"proposal.num_samples_per_ray has {rounds} values, proposal.max_resolutions {networks}",
-            "give as many of each, at least one",
-        )
+        problem = f"proposal.num_samples_per_ray has {rounds} values, proposal.max_resolutions {networks}"
+        raise DataError("model", problem, "give as many of each, at least one")
     counts = {
         "eval_num_rays_per_chunk": config.eval_num_rays_per_chunk,
         "field.num_samples_per_ray": config.field.num_samples_per_ray,

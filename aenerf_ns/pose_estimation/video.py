@@ -45,12 +45,9 @@ class Video:
         count = 0
         for count, frame in enumerate(self.read_frames(), start=1):
             if frame.shape != (self.height, self.width, 3):
-                raise DataError(
-                    self.source,
-                    f"frame {count - 1} has {frame.shape[1]} x {frame.shape[0]} pixels, the first one {self.width} x "
-                    f"{self.height}",
-                    "bring all frames to one size",
-                )
+                size = f"{frame.shape[1]} x {frame.shape[0]}"
+                problem = f"frame {count - 1} has {size} pixels, the first one {self.width} x {self.height}"
+                raise DataError(self.source, problem, "bring all frames to one size")
             yield frame
         if count != len(self.times):
             raise DataError(self.source, f"only {count} of {len(self.times)} frames can be read", "copy it again")

@@ -66,11 +66,8 @@ class FrameSampler(Sampler):
         from, on the device."""
         scene = self.dataset.scene
         if not scene.frames:
-            raise DataError(
-                scene.event_file.path.parent,
-                "it has no training images that the event camera took at known times",
-                "make some with aenerf reconstruct",
-            )
+            problem = "it has no training images that the event camera took at known times"
+            raise DataError(scene.event_file.path.parent, problem, "make some with aenerf reconstruct")
         values = []
         for _, file in scene.frames:
             check_image(file, scene.event_camera)

@@ -150,11 +150,8 @@ class WindowSampler(Sampler):
         super().__init__(config, dataset, supervision, device)
         self.require_between(0, 1, "shortest_window", "longest_window", "share_of_all_pixels")
         if config.shortest_window > config.longest_window:
-            raise DataError(
-                "the sampler",
-                f"shortest-window is {config.shortest_window}, longest-window {config.longest_window}",
-                "give a longest window that is no shorter",
-            )
+            problem = f"shortest-window is {config.shortest_window}, longest-window {config.longest_window}"
+            raise DataError("the sampler", problem, "give a longest window that is no shorter")
         if config.pixels_per_window < 1:
             raise DataError("the sampler", f"pixels-per-window is {config.pixels_per_window}", "give at least 1")
         self._usable = np.flatnonzero(self.pixel_rays.usable)
