@@ -27,12 +27,8 @@ def test_written_dataset_reads_back(native: Path) -> None:
     assert not scene.bounded
     expected = make_trajectory()
     assert torch.equal(scene.trajectory.times, expected.times)
-    torch.testing.assert_close(
-        scene.trajectory.camera_to_worlds,
-        (homogeneous(expected.camera_to_worlds) @ OPENCV_TO_OPENGL)[:, :3],
-        rtol=0,
-        atol=1e-11,
-    )
+    poses = expected.camera_to_worlds @ OPENCV_TO_OPENGL
+    torch.testing.assert_close(scene.trajectory.camera_to_worlds, poses, rtol=0, atol=1e-11)
     for split, values in (("val", [77]), ("test", [78, 79])):
         dataset = EventDataset(parse(NativeDataParserConfig(data=native), split))
         assert [int(dataset.get_numpy_image(i)[0, 0, 0]) for i in range(len(dataset))] == values

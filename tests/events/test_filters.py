@@ -149,9 +149,8 @@ def test_a_cropped_camera_sees_the_same_directions() -> None:
     camera = CameraIntrinsics(12, 10, 8.0, 8.5, 6.2, 4.9, "radial_tangential", (-0.1, 0.02, 0.001, 0.0, 0.0))
     cropped = camera.crop(3, 2, 7, 5)
     assert (cropped.width, cropped.height) == (7, 5)
-    np.testing.assert_allclose(
-        cropped.pixel_directions()[0], camera.pixel_directions()[0][2:7, 3:10], rtol=0, atol=1e-12
-    )
+    expected = camera.pixel_directions()[0][2:7, 3:10]
+    np.testing.assert_allclose(cropped.pixel_directions()[0], expected, rtol=0, atol=1e-12)
 
 
 def test_events_are_counted_on_a_sensor_of_more_pixels_than_16_bits_hold() -> None:

@@ -54,15 +54,12 @@ def test_place_images_at_corrected_poses(run: TrainedRun) -> None:
     np.testing.assert_allclose(timed, corrected.numpy() @ on_rig, atol=1e-9)
     # As the evaluation places it: renderings from there are compared with the image.
     cameras = run.read_reference_views("test").cameras
-    expected = run.scene.to_recording(run.model.camera_optimizer.apply_to_camera(cameras).double())
+    in_scene = run.model.camera_optimizer.apply_to_camera(cameras)
+    expected = run.scene.to_recording(in_scene.double())
     np.testing.assert_allclose(untimed[:3], expected[1], atol=1e-5)
     np.testing.assert_allclose(timed[:3], expected[0], atol=1e-5)
     # And back.
-    np.testing.assert_allclose(
-        run.scene.to_scene(torch.from_numpy(timed)[None])[0],
-        run.model.camera_optimizer.apply_to_camera(cameras)[0],
-        atol=1e-5,
-    )
+    np.testing.assert_allclose(run.scene.to_scene(torch.from_numpy(timed)[None])[0], in_scene[0], atol=1e-5)
 
 
 def test_points_lie_on_their_rays(run: TrainedRun) -> None:

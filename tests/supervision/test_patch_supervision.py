@@ -56,9 +56,8 @@ def test_the_depth_loss_by_hand() -> None:
 def test_the_change_by_flow_by_hand() -> None:
     values = 255 * torch.tensor([[[0.1, 0.2], [0.1, 0.3]]])[..., None]
     along_x = torch.tensor([1.0, 0.0]).expand(1, 2, 2, 2)
-    torch.testing.assert_close(
-        change_by_flow(values, along_x)[..., 0], torch.tensor([[[-25.5, -25.5], [-51.0, -51.0]]])
-    )
+    expected = torch.tensor([[[-25.5, -25.5], [-51.0, -51.0]]])
+    torch.testing.assert_close(change_by_flow(values, along_x)[..., 0], expected)
     along_y = torch.tensor([0.0, 2.0]).expand(1, 2, 2, 2)
     torch.testing.assert_close(change_by_flow(values, along_y)[..., 0], torch.tensor([[[0.0, -51.0], [0.0, -51.0]]]))
     # Each channel by itself.
