@@ -84,13 +84,9 @@ def test_pairs_in_file_equal_those_in_memory(data: Path, reads: list[Path], requ
     assert len(reads) == 2
     batches = []
     for dataset in (in_memory, found):
-        sampler = PairSamplerConfig().setup(
-            dataset=dataset,
-            supervision=PairSupervisionConfig().setup(
-                sensor=dataset.scene.sensor, loss_coefficients=PairLossCoefficients(temporal_loss=1.0)
-            ),
-            device="cpu",
-        )
+        losses = PairLossCoefficients(temporal_loss=1.0)
+        supervision = PairSupervisionConfig().setup(sensor=dataset.scene.sensor, loss_coefficients=losses)
+        sampler = PairSamplerConfig().setup(dataset=dataset, supervision=supervision, device="cpu")
         torch.manual_seed(3)
         batches.append(sampler.sample(300))
     (rays, batch), (mapped_rays, mapped_batch) = batches

@@ -68,13 +68,8 @@ def test_glb_and_obj_look_alike(tmp_path: Path) -> None:
 def test_ply_colors_are_srgb(tmp_path: Path) -> None:
     body = trimesh.creation.box()
     for kind in ("vertex_colors", "face_colors"):
-        colored = trimesh.Trimesh(
-            body.vertices,
-            body.faces,
-            process=False,
-            **{kind: np.array([[200, 100, 50, 255]] * (8 if kind[0] == "v" else 12), np.uint8)},
-        )
-        colored.export(tmp_path / "box.ply")
+        colors = {kind: np.array([[200, 100, 50, 255]] * (8 if kind[0] == "v" else 12), np.uint8)}
+        trimesh.Trimesh(body.vertices, body.faces, process=False, **colors).export(tmp_path / "box.ply")
         mesh = load_mesh(tmp_path / "box.ply", False)
         np.testing.assert_allclose(mesh.color[mesh.faces] / decode(np.array([200, 100, 50]) / 255, "srgb"), 1)
 

@@ -160,13 +160,8 @@ def test_signal_rates_lie_between_those_of_the_intervals(random_poses: torch.Ten
     # One pixel's events after 100, 300, 700 and 1000 ms: +, -, +. The first has no interval before it.
     rows = [(3, 1, EPOCH + 1_000_000 * t, p) for t, p in ((0, 1), (100, 1), (300, -1), (700, 1))]
     period = 50_000_000
-    sampler = make_sampler(
-        random_poses,
-        SensorModel(0.2, 0.3, period, bandwidth=10.0),
-        max_events_per_pair=1,
-        share=0.25,
-        stream=make_stream(rows),
-    )
+    sensor = SensorModel(0.2, 0.3, period, bandwidth=10.0)
+    sampler = make_sampler(random_poses, sensor, share=0.25, stream=make_stream(rows))
     torch.manual_seed(0)
     _, batch = sampler.sample(4000)
     first, second, third = 1 / 0.05, -1 / 0.15, 1 / 0.35
