@@ -97,6 +97,15 @@ class AENeRFModelConfig(ModelConfig):
     eval_num_rays_per_chunk: int = 1 << 13
     """Rays that are rendered at once outside training."""
 
+    def options_of_weights(self) -> dict[str, Any]:
+        """Return by their names the options with which weights of the same shapes show different scenes."""
+        options: dict[str, Any] = {"average_init_density": self.average_init_density}
+        if self.backbone == "hash":
+            options["field.base_resolution"] = self.field.base_resolution
+            options["field.max_resolution"] = self.field.max_resolution
+            options["proposal.max_resolutions"] = tuple(self.proposal.max_resolutions)
+        return options
+
 
 class AENeRFModel(Model):
     """Renders radiance along event rays and compares its logarithm with the events.

@@ -71,7 +71,8 @@ class AENeRFPipeline(VanillaPipeline):
         super().__init__(config, device, test_mode=test_mode, **kwargs)
         self._pose_diagnosis: dict[str, Any] | None = None
         data = self.datamanager
-        self.training_state = TrainingState(data.train_dataset.scene, Path(data.get_datapath()))
+        options = self.model.config.options_of_weights()
+        self.training_state = TrainingState(data.train_dataset.scene, Path(data.get_datapath()), options)
         if test_mode != "inference":
             self.datamanager.supervise(self.model.supervision)
         # Made ahead of training: this run's diagnosis stays empty, and the fit does not read it.

@@ -20,15 +20,17 @@ class TrainingState(nn.Module):
 
     The state holds torch's random generators, the gradients that are being accumulated over steps
     (``gradient_accumulation_steps``), the step at which the proposal networks were last trained, the number of steps
-    that the schedules are made for, and where the scene is in the world of the recording.
+    that the schedules are made for, where the scene is in the world of the recording, and what the weights depend on.
 
     Args:
         scene: that is trained on.
         data: the dataset, for error messages.
+        options: of the model, by their names, that the weights depend on though their number does not.
     """
 
-    def __init__(self, scene: SceneRecording, data: Path) -> None:
+    def __init__(self, scene: SceneRecording, data: Path, options: dict[str, Any]) -> None:
         super().__init__()
+        self._options = options
         frame = scene.frame
         # The (3, 4) float64 map from the recording's world to the scene's: its rotation is scaled.
         self._scene_frame = torch.cat([frame.scale * frame.rotation, frame.translation[:, None]], -1)
@@ -54,13 +56,15 @@ class TrainingState(nn.Module):
             "proposal_sampler": sampler.schedule_state(),
             "schedule_length": trainer.config.schedule_length,
             "scene_frame": self._scene_frame,
+            "options": self._options,
         }
 
     def set_extra_state(self, state: dict[str, Any] | None) -> None:
         """Take a checkpoint's state, for :meth:`resume`. Evaluations load it too, and it does not affect them.
 
         Raises:
-            DataError: the checkpoint is of a scene that is elsewhere: its field and corrections would be, too.
+            DataError: the checkpoint is of a scene that is elsewhere: its field and corrections would be, too. Or its
+                weights are of other options, with which they show another scene.
         """
         # Checkpoints of earlier versions do not say.
         before, now = None if state is None else state.get("scene_frame"), self._scene_frame
@@ -71,6 +75,11 @@ class TrainingState(nn.Module):
                 f"the recording: {now[:, 0].norm():.5g}, there {before[:, 0].norm():.5g})",
                 "give the dataset, time window, scale and other options of the format of that run, or train again",
             )
+        for name, learned in ({} if state is None else state.get("options", {})).items():
+            own = self._options.get(name, learned)
+            if own != learned:
+                remedy = "give the method and the options of that run, or train again"
+                raise DataError("model", f"{name} is {own}, and {learned} in the checkpoint", remedy)
         self._loaded = state
 
     def resume(self, trainer: Trainer, sampler: ProposalSampler) -> None:

@@ -35,6 +35,7 @@ def train_small_model(
     **options: Any,
 ) -> AENeRFTrainer:
     """Train a small model as ns-train does, on the dataset ``data`` of a folder; ``prepare`` may change the trainer."""
+    options.setdefault("pipeline", make_pipeline_config(folder / "data", pose_correction="spline"))
     config = AENeRFTrainerConfig(
         method_name="aenerf",
         experiment_name=name,
@@ -42,7 +43,6 @@ def train_small_model(
         output_dir=folder,
         vis="tensorboard",
         max_num_iterations=num_steps,
-        pipeline=make_pipeline_config(folder / "data", pose_correction="spline"),
         optimizers=deepcopy(aenerf.config.optimizers),
         gradient_accumulation_steps=aenerf.config.gradient_accumulation_steps,
         logging=aenerf.config.logging,

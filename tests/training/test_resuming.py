@@ -76,6 +76,16 @@ def test_a_checkpoint_with_a_scene_elsewhere_is_refused(tmp_path: Path) -> None:
         eval_setup(first.base_dir / "config.yml")
 
 
+def test_a_checkpoint_whose_weights_would_show_another_scene_is_refused(tmp_path: Path) -> None:
+    """Grids of other resolutions have as many weights."""
+    first = train_small_model(tmp_path, "first", 1)
+    config = first.config.pipeline
+    config.model.field.max_resolution = 48
+    line = r"^Error: model: field.max_resolution is 48, and 32 in the checkpoint; give the method and the options"
+    with pytest.raises(SystemExit, match=line):
+        train_small_model(tmp_path, "second", 1, pipeline=config, load_dir=first.checkpoint_dir)
+
+
 @pytest.mark.parametrize("counts_earlier_steps", [False, True])
 def test_resumed_run_reaches_its_last_step(
     counts_earlier_steps: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
