@@ -198,8 +198,8 @@ class AENeRFPipeline(VanillaPipeline):
         what, bad = ("loss", bad_losses) if bad_losses else ("gradient", bad)
         raise SystemExit(
             f"Error: step {step}: {what} not finite ({', '.join(bad)}), training stopped before this reached the "
-            "weights; go on from the last checkpoint or start again, with lower learning rates, without "
-            "--mixed-precision if on, and with poses of sensible scale"
+            "weights; go on from the last checkpoint (with --load-scheduler False, or its own learning rates count) or "
+            "start again, with lower learning rates, without --mixed-precision if on, and with poses of sensible scale"
         )
 
     def trained_run(self) -> TrainedRun:

@@ -180,6 +180,11 @@ class AENeRFTrainer(Trainer):
             problem = f"it holds other parameters than this training: {' '.join(str(error).split())}"
             remedy = "give the method, the options and the version of aenerf-ns that it was made with, or train again"
             raise DataError(str(self.config.load_checkpoint), problem, remedy) from error
+        if not self.config.load_scheduler:
+            # The optimizers have loaded the last rates of the old schedule.
+            for name, schedule in self.optimizers.schedulers.items():
+                (group,), (rate,) = self.optimizers.optimizers[name].param_groups, schedule.get_last_lr()
+                group["lr"] = rate
 
     def train(self) -> None:
         """Train the model, and record how far that came."""

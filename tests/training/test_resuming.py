@@ -182,6 +182,21 @@ def test_a_schedule_that_began_anew_goes_on(tmp_path: Path, capsys: pytest.Captu
     assert_equal(checkpoint(whole), checkpoint(train_small_model(tmp_path, "third", 8, **named)))
 
 
+def test_a_new_schedule_begins_with_its_own_rates(tmp_path: Path) -> None:
+    """The optimizers' states have the last rates of the old one."""
+    first = train_small_model(tmp_path, "first", 6)
+    assert first.optimizers.optimizers["camera_opt"].param_groups[0]["lr"] > 0
+    rates = []
+
+    def note(trainer: AENeRFTrainer) -> None:
+        rates.extend(optimizer.param_groups[0]["lr"] for optimizer in trainer.optimizers.optimizers.values())
+
+    train_small_model(tmp_path, "whole", 1, prepare=note)
+    train_small_model(tmp_path, "second", 1, prepare=note, load_dir=first.base_dir, load_scheduler=False)
+    count = len(rates) // 2
+    assert rates[:count] == rates[count:]
+
+
 def test_a_training_that_is_asked_twice_stops_at_once(tmp_path: Path) -> None:
     def ask_in_a_step(trainer: AENeRFTrainer) -> None:
         step = trainer.train_iteration
