@@ -81,7 +81,7 @@ class PoseCorrection(CameraOptimizer):
 
     Attributes:
         translation_unit: the trajectory's extent, by which translations are counted, in scene units.
-        span: (2,) times of the first and the last given pose in nanoseconds, where twists are learned.
+        span: (2,) times of the first and the last given pose in nanoseconds, where anything is learned.
     """
 
     config: PoseCorrectionConfig
@@ -133,7 +133,7 @@ class PoseCorrection(CameraOptimizer):
             self.twists = TwistNetwork(trajectory)
         elif config.mode == "spline":
             self.twists = TwistSpline(trajectory.duration, config.knot_interval)
-        if self.twists is not None:
+        if self.is_learned:
             self.span: Tensor = nn.Buffer(torch.tensor([trajectory.start, trajectory.end]))
 
     @property
@@ -193,8 +193,9 @@ class PoseCorrection(CameraOptimizer):
             start = float(state_dict.setdefault(f"{prefix}clock_start", self.clock_start))
             if start != self.config.clock_offset:
                 args[-1].append(f"it began with clock-offset {start:g}, not {self.config.clock_offset:g}")
-        # Twists count their times from the start, so they would correct poses of other times.
-        if self.twists is not None:
+        # Twists count their times from the start, so they would correct poses of other times. Offsets count in units of
+        # the trajectory, so they would be others.
+        if self.is_learned:
             learned, own = state_dict.setdefault(f"{prefix}span", self.span).tolist(), self.span.tolist()
             if learned != own:
                 problem = "its poses are from {} to {} ns, and the corrections of poses from {} to {} ns"

@@ -108,11 +108,13 @@ def test_a_learned_clock_offset_belongs_to_its_start() -> None:
         assert again.offsets() == first.offsets()
 
 
-@pytest.mark.parametrize("mode", ["network", "spline"])
-def test_twists_belong_to_the_times_of_their_poses(mode: str) -> None:
+@pytest.mark.parametrize(
+    "options", [{"mode": "network"}, {"mode": "spline"}, {"rigid_offset": True}, {"clock_offset": 0.0}]
+)
+def test_corrections_belong_to_the_times_of_their_poses(options: dict[str, Any]) -> None:
     trajectory = _trajectory()
     later = Trajectory(trajectory.times + 5, trajectory.camera_to_worlds)
-    state, other = _correction(mode=mode).state_dict(), make_correction(later, mode=mode)
+    state, other = _correction(**options).state_dict(), make_correction(later, **options)
     line = "its poses are from 5 to 2000000005 ns, and the corrections of poses from 0 to 2000000000 ns; give"
     with pytest.raises(DataError, match=line):
         other.load_state_dict(state)
