@@ -51,10 +51,12 @@ aenerf = MethodSpecification(
             "proposals": optimized_by(lr=1e-2, eps=1e-15),
             "sensor": optimized_by(lr=0.05),
             "camera_opt": optimized_by(RelativeCosineSchedulerConfig(), lr=8e-3, eps=1e-15),
+            # Closer knots have fewer rays each. Early, or at the full rate, they follow noise (docs/defaults.md).
+            "camera_opt_finer": optimized_by(RelativeCosineSchedulerConfig(relative_delay=0.375), lr=2e-3, eps=1e-15),
         },
         # A batch has few rays for each knot of the spline. If poses follow every single batch, the field stays blurred,
         # at lower rates and in longer runs too (docs/defaults.md).
-        gradient_accumulation_steps={"camera_opt": 8},
+        gradient_accumulation_steps={"camera_opt": 8, "camera_opt_finer": 8},
         logging=LoggingConfig(
             local_writer=LocalWriterConfig(
                 _target=ConsoleWriter, enable=True, stats_to_track=(EventName.ITER_TRAIN_TIME, EventName.ETA)

@@ -26,6 +26,9 @@ _MAX_COMPARED = 2000
 # A step of the optimizer changes hundreds of weights behind each number of a network's twist, but few behind a number
 # of a spline's. With this factor on the network's output, both move about as far at one learning rate.
 _NETWORK_OUTPUT_SCALE = 2e-3
+# Errors of poses that come one by one, as from frames, change from pose to pose. Where poses are further than this from
+# the motion through their neighbors, in radians and extents, a finer spline is added, with so many times closer knots.
+_JITTER, _FINER = 1e-3, 4
 # Poses that the network takes at once where nothing is learned. It takes some 50 kB of memory for each.
 _CHUNK = 2000
 _MIN_EXTENT = 1e-6
@@ -47,7 +50,8 @@ class PoseCorrectionConfig(CameraOptimizerConfig):
     rot_l2_penalty: float = 1.0
     """Weight of the mean squared rotation of the corrections, in radians."""
     knot_interval: float = 0.1
-    """Seconds between the knots of the spline. It corrects errors that change more slowly than that."""
+    """Seconds between the knots of the spline. It corrects errors that change more slowly than that. Where the given
+    poses jitter, a spline with a quarter of it is added, which learns later and more slowly."""
     rigid_offset: bool = False
     """Learn one rigid motion from the given poses to the camera's, the same at all times: the error of a hand-eye
     calibration. It works with every mode."""
@@ -132,7 +136,8 @@ class PoseCorrection(CameraOptimizer):
         if config.mode == "network":
             self.twists = TwistNetwork(trajectory)
         elif config.mode == "spline":
-            self.twists = TwistSpline(trajectory.duration, config.knot_interval)
+            jitters = _jitter(trajectory, extent) > _JITTER
+            self.twists = TwistSpline(trajectory.duration, config.knot_interval, with_finer=jitters)
         if self.is_learned:
             self.span: Tensor = nn.Buffer(torch.tensor([trajectory.start, trajectory.end]))
 
@@ -201,6 +206,10 @@ class PoseCorrection(CameraOptimizer):
                 problem = "its poses are from {} to {} ns, and the corrections of poses from {} to {} ns"
                 remedy = "give the poses and the time window of the run, or train again"
                 raise DataError(self.trajectory.source, problem.format(*own, *learned), remedy)
+        # Checkpoints of earlier versions hold no finer spline either.
+        if isinstance(self.twists, TwistSpline) and self.twists.finer is not None:
+            none = torch.zeros_like(self.twists.finer.control_twists)
+            state_dict.setdefault(f"{prefix}twists.finer.control_twists", none)
         super()._load_from_state_dict(state_dict, prefix, *args)
 
     def _rigid_twists(self, count: int) -> Tensor:
@@ -255,14 +264,15 @@ class PoseCorrection(CameraOptimizer):
         """Return the float64 twists (N, 6) in the world that correct poses, in scene units and radians.
 
         The corrected pose is exp(twist) · base pose, to first order base pose + (v + ω × position). What is learned of
-        the clock offset adds as many seconds of the twist at which the base pose moves.
+        the clock offset adds as many seconds of the twist at which the base pose moves. A finer spline is left out: its
+        corrections differ from pose to pose, so no place moves with them.
 
         Args:
             seconds: (N,) float64 times since the trajectory's start.
             base: (N, 3, 4) base poses at these times, on the clock that training begins with.
         """
         if self.twists is not None:
-            twists = self._twist_units * self.twists(seconds, base)
+            twists = self._twist_units * self.twists.slow(seconds, base)
         else:
             twists = base.new_zeros(len(base), 6)
         if self.rigid_offset is not None:
@@ -340,9 +350,10 @@ class PoseCorrection(CameraOptimizer):
         return self.twists(self._sampled_seconds, self._sampled_poses)
 
     def get_param_groups(self, param_groups: dict[str, list[nn.Parameter]]) -> None:
-        """Add the parameters as the group ``camera_opt``, where there are any."""
-        if self.is_learned:
-            param_groups["camera_opt"] = list(self.parameters())
+        """Add the parameters as the groups ``camera_opt`` and, of a finer spline, ``camera_opt_finer``, if any."""
+        for name, parameter in self.named_parameters():
+            group = "camera_opt_finer" if ".finer." in name else "camera_opt"
+            param_groups.setdefault(group, []).append(parameter)
 
 
 def world_rays(poses: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
@@ -353,6 +364,17 @@ def world_rays(poses: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
         directions: (N, 3) unit vectors in the camera's frame.
     """
     return poses[:, :, 3], (poses[:, :, :3] @ directions[..., None])[..., 0]
+
+
+def _jitter(trajectory: Trajectory, extent: float) -> float:
+    """Return the median distance of every second pose from the motion through the others, in radians and extents."""
+    times, poses = trajectory.times, trajectory.camera_to_worlds
+    if len(times) < 3:
+        return 0.0
+    off = Trajectory(times[::2], poses[::2], trajectory.source).interpolate(times[1:-1:2]) - poses[1:-1:2]
+    # The norm of a small rotation matrix's change is √2 times the angle.
+    angles, distances = off[..., :3].flatten(1).norm(dim=-1) / math.sqrt(2), off[..., 3].norm(dim=-1) / extent
+    return float(torch.hypot(angles, distances).median())
 
 
 def _compared_times(trajectory: Trajectory, ground_truth: Trajectory | None) -> Tensor:
@@ -406,6 +428,8 @@ class TwistNetwork(nn.Module):
             embedded = F.softplus(pose) + F.softplus(self.time_embedding(time))
             return (_NETWORK_OUTPUT_SCALE * self.output(self.hidden(self.encoding(embedded)))).double()
 
+    slow = forward
+
     def with_rate(self, seconds: Tensor, base: Tensor, base_rate: Tensor) -> tuple[Tensor, Tensor]:
         """Return float64 twists and their rates per second (N, 6), for estimated poses and their rates (N, 3, 4)."""
         with forward_ad.dual_level():
@@ -417,15 +441,17 @@ class TwistNetwork(nn.Module):
 
 
 class TwistSpline(nn.Module):
-    """A uniform cubic B-spline of twists.
+    """A uniform cubic B-spline of twists, on which a finer one can be added.
 
     Args:
         duration: seconds it spans.
         knot_interval: seconds between knots.
+        with_finer: add a spline whose knots are four times closer.
     """
 
-    def __init__(self, duration: float, knot_interval: float) -> None:
+    def __init__(self, duration: float, knot_interval: float, with_finer: bool = False) -> None:
         super().__init__()
+        self.finer = TwistSpline(duration, knot_interval / _FINER) if with_finer else None
         self._segments = max(math.ceil(duration / knot_interval), 1)
         self._interval = duration / self._segments
         self.control_twists = nn.Parameter(torch.zeros(self._segments + 3, 6))
@@ -444,11 +470,19 @@ class TwistSpline(nn.Module):
 
     def forward(self, seconds: Tensor, base: Tensor) -> Tensor:
         """Return float64 twists (N, 6) at (N,) seconds. The poses play no part."""
+        twist = self.slow(seconds, base)
+        return twist if self.finer is None else twist + self.finer(seconds, base)
+
+    def slow(self, seconds: Tensor, base: Tensor) -> Tensor:
+        """Return the twists of :meth:`forward` without the finer spline."""
         return self._evaluate(seconds, self._basis[:, :4])[:, 0]
 
     def with_rate(self, seconds: Tensor, base: Tensor, base_rate: Tensor) -> tuple[Tensor, Tensor]:
         """Return float64 twists and their rates per second (N, 6). The poses play no part."""
         twist, rate = self._evaluate(seconds, self._basis).unbind(1)
+        if self.finer is not None:
+            finer, finer_rate = self.finer.with_rate(seconds, base, base_rate)
+            twist, rate = twist + finer, rate + finer_rate
         return twist, rate
 
     def _evaluate(self, seconds: Tensor, basis: Tensor) -> Tensor:

@@ -99,6 +99,8 @@ class RelativeCosineSchedulerConfig(SchedulerConfig):
     _target: type = field(default_factory=lambda: RelativeCosineScheduler)
     delay: int = 100
     """Steps in which the rate is zero."""
+    relative_delay: float = 0.0
+    """Part of the run in which it is zero, too."""
     warm_up: int = 100
     """Steps after the delay in which the rate rises."""
     final_factor: float = 0.01
@@ -115,4 +117,5 @@ class RelativeCosineScheduler(Scheduler):
     def get_scheduler(self, optimizer: Optimizer, lr_init: float) -> LRScheduler:
         """Return the schedule of an optimizer whose learning rate is ``lr_init``."""
         config = self.config
-        return LambdaLR(optimizer, _CosineFactor(config.delay, config.warm_up, config.max_steps, config.final_factor))
+        delay = max(config.delay, round(config.relative_delay * config.max_steps))
+        return LambdaLR(optimizer, _CosineFactor(delay, config.warm_up, config.max_steps, config.final_factor))

@@ -4,15 +4,17 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from helpers.small_models import make_correction
+from scipy.interpolate import BSpline
 from torch import Tensor
 
 from aenerf_ns.camera.rotation import motion_from_twist
 from aenerf_ns.camera.trajectory import Trajectory, homogeneous
 from aenerf_ns.errors import DataError
-from aenerf_ns.method.pose_correction import PoseCorrection, world_rays
+from aenerf_ns.method.pose_correction import PoseCorrection, TwistSpline, world_rays
 
 _RIGID = torch.tensor([0.01, -0.02, 0.015, 0.02, 0.03, -0.01], dtype=torch.float64)
 
@@ -27,9 +29,16 @@ def _trajectory() -> Trajectory:
     return Trajectory((seconds * 1e9).round().long(), above @ motion_from_twist(twists))
 
 
-def _correction(**options: Any) -> PoseCorrection:
+def _jittering(size: float = 0.003) -> Trajectory:
+    """The same camera, but every pose is off by its own error, in radians and units."""
+    smooth, generator = _trajectory(), torch.Generator().manual_seed(0)
+    errors = motion_from_twist(size * torch.randn(len(smooth), 6, dtype=torch.float64, generator=generator))
+    return Trajectory(smooth.times, homogeneous(smooth.camera_to_worlds) @ errors)
+
+
+def _correction(jitter: bool = False, **options: Any) -> PoseCorrection:
     torch.manual_seed(0)
-    return make_correction(_trajectory(), **options)
+    return make_correction(_jittering() if jitter else _trajectory(), **options)
 
 
 def _set(correction: PoseCorrection, size: float) -> None:
@@ -45,10 +54,10 @@ def _penalty(correction: PoseCorrection) -> float:
     return float(losses["pose_correction_penalty"])
 
 
-@pytest.mark.parametrize("mode", ["off", "network", "spline"])
+@pytest.mark.parametrize(("mode", "jitter"), [("off", False), ("network", False), ("spline", False), ("spline", True)])
 @pytest.mark.parametrize("offsets", [{"rigid_offset": True}, {"clock_offset": 0.03}])
-def test_poses_and_rates_are_exact(mode: str, offsets: dict[str, Any]) -> None:
-    correction = _correction(mode=mode, **offsets)
+def test_poses_and_rates_are_exact(mode: str, jitter: bool, offsets: dict[str, Any]) -> None:
+    correction = _correction(jitter, mode=mode, **offsets)
     _set(correction, 0.1)
     # At both ends there are times that the clock offset moves out of the trajectory.
     seconds = torch.linspace(0.0013, 1.9987, 999, dtype=torch.float64)
@@ -246,6 +255,58 @@ def test_a_camera_that_only_turns_is_corrected_in_scene_units() -> None:
         correction.twists.control_twists[:, 0] = 0.5
     distance = correction.pose(torch.linspace(0, 2, 9, dtype=torch.float64))[:, :, 3].norm(dim=-1)
     torch.testing.assert_close(distance, torch.full_like(distance, 0.5))
+
+
+@pytest.mark.parametrize("finer", [False, True])
+def test_the_spline_is_that_of_scipy(finer: bool) -> None:
+    spline, nothing = TwistSpline(1.31, 0.1, finer), torch.empty(0)
+    expected = []
+    for control, segments in zip(spline.parameters(), (14, 53), strict=False):
+        torch.nn.init.normal_(control, generator=torch.Generator().manual_seed(0))
+        knots = 1.31 / segments * np.arange(-3, segments + 4)
+        expected.append(BSpline(knots, control.detach().double().numpy(), 3))
+    assert len(expected) == 1 + finer
+    seconds = torch.linspace(0, 1.31, 99, dtype=torch.float64)
+    twist, rate = spline.with_rate(seconds, nothing, nothing)
+    for found, order in ((spline(seconds, nothing), 0), (twist, 0), (rate, 1)):
+        total = sum(part.derivative(order)(seconds) for part in expected)
+        np.testing.assert_allclose(found.detach(), total, rtol=0, atol=1e-11)
+    np.testing.assert_allclose(spline.slow(seconds, nothing).detach(), expected[0](seconds), rtol=0, atol=1e-13)
+
+
+@pytest.mark.parametrize(
+    ("trajectory", "counts"),
+    [
+        (_trajectory(), {"camera_opt": 23}),
+        # Below the limit, as poses of a motion capture are.
+        (_jittering(1e-4), {"camera_opt": 23}),
+        (_jittering(), {"camera_opt": 23, "camera_opt_finer": 83}),
+        (Trajectory([0, 2_000_000_000], _trajectory().camera_to_worlds[::400]), {"camera_opt": 23}),
+    ],
+)
+def test_poses_that_jitter_get_a_finer_spline(trajectory: Trajectory, counts: dict[str, int]) -> None:
+    groups: dict[str, list] = {}
+    make_correction(trajectory, mode="spline").get_param_groups(groups)
+    assert {name: sum(map(len, group)) for name, group in groups.items()} == counts
+
+
+def test_the_field_moves_with_the_slow_part_alone() -> None:
+    correction = _correction(jitter=True, mode="spline")
+    seconds = torch.linspace(0, 2, 9, dtype=torch.float64)
+    base = correction.trajectory.pose(seconds)
+    with torch.no_grad():
+        correction.twists.finer.control_twists.fill_(0.1)
+    assert not correction.world_twists(seconds, base).any()
+    assert (correction.pose(seconds) != base).flatten(1).any(1).all()
+
+
+def test_checkpoints_without_a_finer_spline_load() -> None:
+    correction, earlier = _correction(jitter=True, mode="spline"), _correction(mode="spline")
+    _set(earlier, 0.1)
+    seconds = torch.linspace(0, 2, 9, dtype=torch.float64)
+    correction.load_state_dict(earlier.state_dict())
+    expected = earlier.twists(seconds, torch.empty(0))
+    torch.testing.assert_close(correction.twists(seconds, torch.empty(0)), expected, rtol=0, atol=0)
 
 
 def test_the_spline_is_smooth_and_reproduces_a_straight_line() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from itertools import pairwise
 
 import pytest
@@ -46,3 +47,12 @@ def test_the_pose_corrections_rate_rises_and_falls() -> None:
     assert rates[125] == pytest.approx(0.2 * 0.505)
     assert rates[250] == pytest.approx(0.002)
     assert all(later <= earlier for earlier, later in pairwise(rates[15:]))
+
+
+def test_a_delay_follows_the_length_of_the_run() -> None:
+    config = RelativeCosineSchedulerConfig(delay=5, relative_delay=0.4, warm_up=10, max_steps=250)
+    rates = run(*make_scheduler(config), 251)
+    assert rates[:100] == [0.0] * 100
+    # It rises in ten steps, while the cosine falls.
+    assert rates[100] == pytest.approx(0.2 * 0.1 * (0.01 + 0.99 * (1 + math.cos(0.4 * math.pi)) / 2))
+    assert rates[250] == pytest.approx(0.002)
