@@ -100,7 +100,7 @@ class RelativeCosineSchedulerConfig(SchedulerConfig):
     delay: int = 100
     """Steps in which the rate is zero."""
     relative_delay: float = 0.0
-    """Part of the run in which it is zero, too."""
+    """Part of the run in which the rate is zero, where that is longer."""
     warm_up: int = 100
     """Steps after the delay in which the rate rises."""
     final_factor: float = 0.01
