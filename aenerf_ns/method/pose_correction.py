@@ -15,7 +15,7 @@ from nerfstudio.cameras.rays import RayBundle
 from nerfstudio.field_components.encodings import NeRFEncoding
 from torch import Tensor, nn
 
-from aenerf_ns.camera.alignment import Similarity, align
+from aenerf_ns.camera.alignment import Similarity, align, rotation_angle
 from aenerf_ns.camera.metadata_keys import CAMERA_DIRECTIONS, REFERENCE_SECONDS, TRAJECTORY_SECONDS
 from aenerf_ns.camera.rotation import TwistExponential
 from aenerf_ns.camera.trajectory import Trajectory, homogeneous
@@ -371,10 +371,9 @@ def _jitter(trajectory: Trajectory, extent: float) -> float:
     times, poses = trajectory.times, trajectory.camera_to_worlds
     if len(times) < 3:
         return 0.0
-    off = Trajectory(times[::2], poses[::2], trajectory.source).interpolate(times[1:-1:2]) - poses[1:-1:2]
-    # The norm of a small rotation matrix's change is √2 times the angle.
-    angles, distances = off[..., :3].flatten(1).norm(dim=-1) / math.sqrt(2), off[..., 3].norm(dim=-1) / extent
-    return float(torch.hypot(angles, distances).median())
+    smooth = Trajectory(times[::2], poses[::2], trajectory.source).interpolate(times[1:-1:2])
+    distances = (smooth - poses[1:-1:2])[..., 3].norm(dim=-1) / extent
+    return float(torch.hypot(rotation_angle(smooth, poses[1:-1:2]), distances).median())
 
 
 def _compared_times(trajectory: Trajectory, ground_truth: Trajectory | None) -> Tensor:
