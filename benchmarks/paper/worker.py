@@ -57,6 +57,26 @@ def prepare() -> None:
     os.environ["TORCH_FORCE_NO_WEIGHTS_ONLY_LOAD"] = "1"
 
 
+def keep_renderings() -> None:
+    """Let views that are rendered twice keep what was rendered at first, because rendering takes most of the time."""
+    from nerfstudio.cameras.cameras import Cameras
+
+    from aenerf_ns.method.model import AENeRFModel
+
+    render, kept = AENeRFModel.get_outputs_for_camera, {}
+
+    def render_once(model: AENeRFModel, camera: Cameras) -> dict[str, Tensor]:
+        if not camera.metadata:
+            # Its pose was refined under one color correction.
+            return render(model, camera)
+        pose = camera.camera_to_worlds.cpu().numpy().tobytes()
+        if pose not in kept:
+            kept[pose] = render(model, camera)
+        return {**kept[pose], "rgb": model.display(kept[pose]["log_radiance"])}
+
+    AENeRFModel.get_outputs_for_camera = render_once  # type: ignore[method-assign,assignment]
+
+
 def main() -> None:
     """Train, evaluate and export."""
     begin = time.perf_counter()
@@ -80,6 +100,8 @@ def main() -> None:
     (config,) = (Path("outputs") / name).rglob("config.yml")
     folder = Path("runs") / name
     file = folder / "evaluation.json"
+    if method != "nerfacto":
+        keep_renderings()
     ComputePSNR(config, file, folder / "pictures").main()
     evaluation = {**json.loads(file.read_text("utf8")), "train_seconds": seconds}
     if method != "nerfacto":
