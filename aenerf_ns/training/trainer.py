@@ -10,6 +10,7 @@ import sys
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
+from copy import deepcopy
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -17,6 +18,7 @@ from typing import Any, Literal
 import torch
 import yaml
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocation
+from nerfstudio.engine.optimizers import Optimizers
 from nerfstudio.engine.trainer import Trainer, TrainerConfig
 from nerfstudio.utils import comms
 from nerfstudio.utils.decorators import check_main_thread
@@ -30,6 +32,10 @@ from aenerf_ns.training.datamanager import EventDataManager
 from aenerf_ns.training.preflight import require_device
 from aenerf_ns.training.run_record import RunRecord, ScalarWriter
 from aenerf_ns.training.schedules import RelativeCosineSchedulerConfig, RelativeMultiStepSchedulerConfig
+
+# The focal length in pixels up to which a spline of poses learns at the rates of the configuration. Beyond it, the same
+# step in radians is so many pixels that poses tremble until late in the run (docs/defaults.md).
+_FOCAL_LENGTH = 250.0
 
 
 @dataclass
@@ -169,6 +175,16 @@ class AENeRFTrainer(Trainer):
                 data = self.pipeline.datamanager.resolved_config()
                 resolved = replace(self.config, pipeline=replace(self.config.pipeline, datamanager=data))  # type: ignore[call-arg]
                 partial.write_text(yaml.dump(resolved), "utf8")
+
+    def setup_optimizers(self) -> Optimizers:
+        """Return the optimizers, with lower rates for a spline of poses where the camera's focal length is long."""
+        optimizers = deepcopy(self.config.optimizers)
+        if self.pipeline.model.config.camera_optimizer.mode == "spline":
+            assert isinstance(self.pipeline.datamanager, EventDataManager)
+            focal_length = self.pipeline.datamanager.train_dataset.scene.event_camera.fx
+            for name in optimizers.keys() & {"camera_opt", "camera_opt_finer"}:
+                optimizers[name]["optimizer"].lr *= min(_FOCAL_LENGTH / focal_length, 1.0)
+        return Optimizers(optimizers, self.pipeline.get_param_groups())
 
     def _load_checkpoint(self) -> None:
         try:

@@ -34,11 +34,6 @@ _NOISE = {
 _STEPS = {"full": 30000, "medium": 4000, "tiny": 1500}
 # A CPU renders 100 views of this size in four minutes, so a run of medium scale has no curve over the training.
 _MEDIUM_TRAIN = ("--steps-per-eval-all-images", "0")
-# Where poses are corrected. A radian is 415 pixels here, not the 115 for which the default rate of 0.008 was chosen.
-_MEDIUM_RATES = (
-    "--optimizers.camera-opt.optimizer.lr", "0.003",
-    "--optimizers.camera-opt-finer.optimizer.lr", "0.001",
-)  # fmt: skip
 # Pairs of a batch in the table of losses. They are as many as the methods' own batches hold, at two rays a pair.
 _PAIRS = {"full": 1024, "medium": 256, "tiny": 256}
 
@@ -240,11 +235,10 @@ class Plan:
         if method == "nerfacto":
             return {CEILING: (method, () if self.scale == "full" else SMALL_NERFACTO, (), ())}
         train = self._train_options()
-        corrected = (*(_MEDIUM_RATES if self.scale == "medium" else ()), *train)
-        off, spline = (*train, *_OFF), (*corrected, *_SPLINE)
+        off, spline = (*train, *_OFF), (*train, *_SPLINE)
         images: tuple[str, ...] = ()
         if method == "aenerf":
-            options = {OURS: corrected, WITHOUT_CORRECTION: off, TRUE_POSES: off}
+            options = {OURS: train, WITHOUT_CORRECTION: off, TRUE_POSES: off}
         else:
             name = PEERS[method]
             if method == "e2vid-nerf" and self.e2vid_weights is not None:
@@ -257,7 +251,7 @@ class Plan:
         registered = self._registered(method)
         return {
             **{row: (registered, words, images, ()) for row, words in options.items()},
-            **{row: (registered, corrected, (), words) for row, words in further.items()},
+            **{row: (registered, train, (), words) for row, words in further.items()},
         }
 
 

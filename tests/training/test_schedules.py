@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import math
 from itertools import pairwise
+from pathlib import Path
 
 import pytest
 import torch
+from helpers.small_pipelines import make_pipeline_config
+from helpers.small_trainings import train_small_model
 from torch.optim.lr_scheduler import LRScheduler
 
 from aenerf_ns.training.schedules import RelativeCosineSchedulerConfig, RelativeMultiStepSchedulerConfig
@@ -56,3 +59,19 @@ def test_a_delay_follows_the_length_of_the_run() -> None:
     # It rises in ten steps, while the cosine falls.
     assert rates[100] == pytest.approx(0.2 * 0.1 * (0.01 + 0.99 * (1 + math.cos(0.4 * math.pi)) / 2))
     assert rates[250] == pytest.approx(0.002)
+
+
+@pytest.mark.parametrize(("mode", "focal_length", "factor"), [("spline", 5, 1), ("spline", 500, 0.5), ("network", 500, 1)])
+def test_a_spline_of_poses_learns_more_slowly_through_a_long_lens(
+    tmp_path: Path, mode: str, focal_length: float, factor: float
+) -> None:
+    pipeline = make_pipeline_config(tmp_path / "data", pose_correction=mode)
+    description = tmp_path / "data" / "transforms.json"
+    description.write_text(description.read_text().replace('"fl_x": 5.0', f'"fl_x": {focal_length}.0'))
+    trainer = train_small_model(tmp_path, "run", 3, pipeline=pipeline)
+    assert trainer.pipeline.datamanager.train_dataset.scene.event_camera.fx == focal_length
+    rates = {name: schedule.base_lrs for name, schedule in trainer.optimizers.schedulers.items()}
+    configured = {name: [trainer.config.optimizers[name]["optimizer"].lr] for name in rates}
+    configured["camera_opt"][0] *= factor
+    assert rates == configured
+    assert configured["camera_opt"] == [factor * 8e-3]
