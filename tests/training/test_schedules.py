@@ -61,15 +61,15 @@ def test_a_delay_follows_the_length_of_the_run() -> None:
     assert rates[250] == pytest.approx(0.002)
 
 
-@pytest.mark.parametrize(("mode", "focal_length", "factor"), [("spline", 5, 1), ("spline", 500, 0.5), ("network", 500, 1)])
+@pytest.mark.parametrize(("mode", "focal", "factor"), [("spline", 5, 1), ("spline", 500, 0.5), ("network", 500, 1)])
 def test_a_spline_of_poses_learns_more_slowly_through_a_long_lens(
-    tmp_path: Path, mode: str, focal_length: float, factor: float
+    tmp_path: Path, mode: str, focal: float, factor: float
 ) -> None:
     pipeline = make_pipeline_config(tmp_path / "data", pose_correction=mode)
     description = tmp_path / "data" / "transforms.json"
-    description.write_text(description.read_text().replace('"fl_x": 5.0', f'"fl_x": {focal_length}.0'))
+    description.write_text(description.read_text().replace('"fl_x": 5.0', f'"fl_x": {focal}.0'))
     trainer = train_small_model(tmp_path, "run", 3, pipeline=pipeline)
-    assert trainer.pipeline.datamanager.train_dataset.scene.event_camera.fx == focal_length
+    assert trainer.pipeline.datamanager.train_dataset.scene.event_camera.fx == focal
     rates = {name: schedule.base_lrs for name, schedule in trainer.optimizers.schedulers.items()}
     configured = {name: [trainer.config.optimizers[name]["optimizer"].lr] for name in rates}
     configured["camera_opt"][0] *= factor
