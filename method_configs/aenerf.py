@@ -50,6 +50,7 @@ aenerf = MethodSpecification(
             "networks": optimized_by(lr=1e-2, eps=1e-15, weight_decay=1e-6),
             "proposals": optimized_by(lr=1e-2, eps=1e-15),
             "sensor": optimized_by(lr=0.05),
+            # The trainer lowers both rates of the poses where the focal length is long.
             "camera_opt": optimized_by(RelativeCosineSchedulerConfig(), lr=8e-3, eps=1e-15),
             # Closer knots have fewer rays each. Early, or at the full rate, they follow noise (docs/defaults.md).
             "camera_opt_finer": optimized_by(RelativeCosineSchedulerConfig(relative_delay=0.375), lr=2e-3, eps=1e-15),
