@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from aenerf_ns.camera.trajectory import Trajectory
     from aenerf_ns.events.filters import EventFilters, EventSelection
     from aenerf_ns.events.stream import EventStream
-    from aenerf_ns.pose_estimation.from_frames import EstimatedPoses
+    from aenerf_ns.pose_estimation.placement import EstimatedPoses
     from aenerf_ns.recording.dataparser import EventDataParser
     from aenerf_ns.recording.output_lock import OutputLock
     from aenerf_ns.recording.recording import Capture, Recording

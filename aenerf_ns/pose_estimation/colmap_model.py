@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -26,25 +27,44 @@ _MAX_TURN = 30.0
 
 
 def placed_images(model: Any, only_linked: bool = True) -> list[Any]:
-    """Return the images that have a pose. See :func:`poses_of`."""
+    """Return the images that have a pose, in the order of the frames. See :func:`poses_of`."""
     images = [image for image in model.images.values() if image.has_pose and image.num_points3D >= MIN_POINTS]
-    return _linked(images) if only_linked else images
+    images.sort(key=_index)
+    return _linked(images) if only_linked and len(images) > 1 else images
+
+
+def _index(image: Any) -> int:
+    return int(Path(image.name).stem)
 
 
 def _linked(images: list[Any]) -> list[Any]:
     """Return the largest group of images that holds together: each shares enough points with another, and not with far
-    fewer than most do."""
-    if not images:
-        return images
+    fewer than most do, and the path goes on from the image before it or to the one after it."""
+    links = _count_shared_points(images) >= MIN_POINTS
+    partners = np.asarray(links.sum(1)).ravel() - 1
+    goes_on = _goes_on(images)
+    is_held = np.append(goes_on, False) | np.append(False, goes_on)
+    held = np.flatnonzero(is_held & (partners >= min(_SHARE * np.median(partners), _ENOUGH_PARTNERS)))
+    groups = connected_components(links[held][:, held])[1]
+    return [images[i] for i in held[groups == np.bincount(groups).argmax()]] if len(held) else []
+
+
+def _count_shared_points(images: list[Any]) -> csr_array:
+    """Return the (N, N) numbers of points that two images both see."""
     points = [[point.point3D_id for point in image.points2D if point.has_point3D()] for image in images]
     rows = np.repeat(np.arange(len(images)), [len(seen) for seen in points])
     columns = np.unique(np.concatenate(points), return_inverse=True)[1]
     sees = csr_array((np.ones(len(rows)), (rows, columns)))
-    links = sees @ sees.T >= MIN_POINTS
-    partners = np.asarray(links.sum(1)).ravel() - 1
-    held = np.flatnonzero(partners >= min(_SHARE * np.median(partners), _ENOUGH_PARTNERS))
-    groups = connected_components(links[held][:, held])[1]
-    return [images[i] for i in held[groups == np.bincount(groups).argmax()]]
+    return sees @ sees.T
+
+
+def _goes_on(images: list[Any]) -> NDArray[np.bool_]:
+    """Return whether the path goes on from each image to the next, (N - 1): both see some of the same points, and the
+    camera turns little."""
+    rotations = [image.cam_from_world().rotation for image in images]
+    turns = [first.angle_to(second) for first, second in pairwise(rotations)]
+    limits = np.deg2rad(_MAX_TURN) * np.diff([_index(image) for image in images])
+    return (_count_shared_points(images).diagonal(1) >= MIN_POINTS) & (np.array(turns) < limits)
 
 
 def poses_of(model: Any, only_linked: bool = True) -> dict[int, NDArray[np.float64]]:
@@ -52,12 +72,10 @@ def poses_of(model: Any, only_linked: bool = True) -> dict[int, NDArray[np.float
 
     Args:
         model: COLMAP's. Frames that see fewer than MIN_POINTS points have no pose.
-        only_linked: neither have frames that share as many with too few others: they, or their group, may lie anywhere.
+        only_linked: neither have frames that share as many with too few others, or with neither of the frames before
+            and after them, or turn far from both: they, or their group, may lie anywhere.
     """
-    return {
-        int(Path(image.name).stem): image.cam_from_world().inverse().matrix()
-        for image in placed_images(model, only_linked)
-    }
+    return {_index(image): image.cam_from_world().inverse().matrix() for image in placed_images(model, only_linked)}
 
 
 def is_placed(model: Any) -> bool:
@@ -66,15 +84,14 @@ def is_placed(model: Any) -> bool:
 
 
 def is_sound(model: Any, max_pixels: float) -> bool:
-    """Return whether a model's mean error of reprojection is small, and its path turns little from frame to frame.
+    """Return whether a model's mean error of reprojection is small, and its path has no break.
 
     A mapper may throw frames far out where it sees nothing, and join parts that look alike the wrong way round. Where
-    one ends and the next begins, the camera would turn at once.
+    one part ends and the next begins, frames that follow each other share no points, or the camera turns at once.
     """
-    poses = poses_of(model)
-    turns = [poses[i][:, :3].T @ poses[i + 1][:, :3] for i in poses if i + 1 in poses]
+    images = placed_images(model)
     is_near = model.compute_mean_reprojection_error() < max_pixels
-    return bool(is_near and turns and Rotation.from_matrix(turns).magnitude().max() < np.deg2rad(_MAX_TURN))
+    return bool(is_near and len(images) > 1 and _goes_on(images).all())
 
 
 def stand_upright(model: Any) -> None:

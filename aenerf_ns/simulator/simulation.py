@@ -140,6 +140,8 @@ class Simulation:
     ) -> tuple[Trajectory, dict[str, Any], str]:
         """Run COLMAP on the frames of a camera at the event sensor's position, as in a DAVIS.
 
+        The poses stay as COLMAP's incremental mapper leaves them, as in published datasets.
+
         The truth provides only what pictures cannot: the position, orientation and scale of the world.
 
         Args:
@@ -160,7 +162,7 @@ class Simulation:
 
         times = self.frame_times(frame_rate, exposure)
         frames = (self.blurred_frame(int(time), exposure) for time in times)
-        found = estimate_poses(frames, times, self._camera, "frames of aenerf simulate", seed)
+        found = estimate_poses(frames, times, self._camera, "frames of aenerf simulate", seed, adjusted=False)
         true_poses = torch.stack([self.pose(time)[:3] for time in found.trajectory.times.tolist()])
         estimated, errors = compare_with_truth(found.trajectory, true_poses)
         knots = truth.knots_between(estimated.start, estimated.end)

@@ -30,7 +30,7 @@ from aenerf_ns.errors import DataError
 from aenerf_ns.files.event_hdf5 import Hdf5EventWriter
 from aenerf_ns.files.tum_trajectory import read_tum_trajectory, write_tum_trajectory
 from aenerf_ns.pose_estimation import from_frames
-from aenerf_ns.pose_estimation.from_frames import EstimatedPoses
+from aenerf_ns.pose_estimation.placement import EstimatedPoses
 from aenerf_ns.recording.recording import Capture, Recording
 from aenerf_ns.recording.writer import NativeDatasetWriter
 

@@ -11,7 +11,7 @@ import torch
 
 from aenerf_ns.camera.intrinsics import CameraIntrinsics
 from aenerf_ns.camera.trajectory import Trajectory
-from aenerf_ns.pose_estimation.from_frames import EstimatedPoses
+from aenerf_ns.pose_estimation.placement import EstimatedPoses
 
 FOUND_BOX = torch.tensor([[-1.0, -2.0, -3.0], [1.0, 2.0, 3.0]], dtype=torch.float64)
 
@@ -34,7 +34,7 @@ def model_of(*seen: range) -> SimpleNamespace:
 def place_frames(num_placed: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """Let COLMAP place the first frames along a straight line, and estimate a lens where it is asked for one."""
 
-    def place(frames, times, camera, source, seed, folder=None) -> EstimatedPoses:
+    def place(frames, times, camera, source, seed, folder=None, adjusted=True) -> EstimatedPoses:
         assert len(list(frames)) == len(times)
         if not isinstance(camera, CameraIntrinsics):
             camera = CameraIntrinsics(*camera, 22.0, 22.0, 12.0, 8.0, distortion=(0.01, 0.0, 0.0, 0.0, 0.0))

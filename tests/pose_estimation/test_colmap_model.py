@@ -27,7 +27,7 @@ def test_a_group_of_frames_that_hangs_by_few_points_has_no_pose(num_shared: int,
 def test_a_frame_that_shares_points_with_few_others_has_no_pose(
     num_frames: int, num_partners: int, is_placed: bool
 ) -> None:
-    frames = [range(115)] * num_partners + [range(100)] * (num_frames - num_partners)
+    frames = [range(100)] * (num_frames - num_partners) + [range(115)] * num_partners
     assert len(poses_of(model_of(*frames, range(100, 200)))) == num_frames + is_placed
 
 
@@ -44,7 +44,18 @@ def test_a_model_is_sound(turn: float, pixels: float, sound: bool) -> None:
     assert is_sound(model, 4.0) is sound
 
 
-def test_worlds_stand_upright() -> None:
+@pytest.mark.parametrize(("shared", "turn", "has_pose"), [(20, 0.0, True), (0, 0.0, False), (20, 40.0, False)])
+def test_a_frame_apart_from_those_before_and_after_it_has_no_pose(shared: int, turn: float, has_pose: bool) -> None:
+    # Frames of another time see what it sees, too.
+    model = model_of(*[range(100)] * 4, range(100 - shared, 200), *[range(100)] * 4, *[range(80, 200)] * 6)
+    turned = pycolmap.Rigid3d(pycolmap.Rotation3d([0, np.deg2rad(turn), 0]), [0, 0, 0])
+    model.images[4].cam_from_world = lambda: turned
+    assert (4 in poses_of(model)) == has_pose
+
+
+def test_worlds_stand_upright(monkeypatch: pytest.MonkeyPatch) -> None:
+    # These frames are no video.
+    monkeypatch.setattr("aenerf_ns.pose_estimation.colmap_model._MAX_TURN", 180.0)
     options = pycolmap.SyntheticDatasetOptions()
     options.num_rigs, options.num_cameras_per_rig, options.num_frames_per_rig = 1, 1, 12
     model = pycolmap.synthesize_dataset(options)
