@@ -94,6 +94,13 @@ def is_sound(model: Any, max_pixels: float) -> bool:
     return bool(is_near and len(images) > 1 and _goes_on(images).all())
 
 
+def breaks_of(model: Any) -> list[int]:
+    """Return the indices of frames that have a pose, as the next frame has, but whose path does not go on to it."""
+    images = placed_images(model)
+    indices = np.array([_index(image) for image in images])
+    return indices[:-1][~_goes_on(images) & (np.diff(indices) == 1)].tolist()
+
+
 def stand_upright(model: Any) -> None:
     """Turn and move the world of a model: z is up if its frames were held level, and the origin is amid them.
 

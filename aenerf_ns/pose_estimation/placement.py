@@ -18,7 +18,14 @@ from aenerf_ns.camera.intrinsics import CameraIntrinsics
 from aenerf_ns.camera.time_window import runs_of
 from aenerf_ns.camera.trajectory import Trajectory
 from aenerf_ns.errors import DataError
-from aenerf_ns.pose_estimation.colmap_model import is_placed, is_sound, poses_of, stand_upright, trajectory_of
+from aenerf_ns.pose_estimation.colmap_model import (
+    breaks_of,
+    is_placed,
+    is_sound,
+    poses_of,
+    stand_upright,
+    trajectory_of,
+)
 from aenerf_ns.pose_estimation.colmap_workspace import ColmapWorkspace
 from aenerf_ns.pose_estimation.picture import draw_poses, observations_of
 from aenerf_ns.pose_estimation.scene_box import box_of
@@ -36,7 +43,8 @@ _ROUNDS = ((12.0, 8.0, 1.0), (4.0, 2.0, 0.5))
 # A round before them for a model whose path has a break: matches across the break are off by many pixels.
 _MENDING = (24.0, 16.0, 2.0)
 
-_MAX_GAPS_SHOWN = 10
+# Gaps or breaks that the summary names.
+_MAX_SHOWN = 10
 
 
 @dataclass(frozen=True)
@@ -58,6 +66,7 @@ class EstimatedPoses:
         images: what the frames are, for people to read.
         mapper: COLMAP's mapper whose model was taken, incremental or global.
         agreement: share of the matches kept apart that fit the poses; None where none were kept apart.
+        breaks: times in nanoseconds of the frames after which the path breaks: the parts may lie the wrong way round.
         max_lost: frames in a row without a pose across which poses are interpolated; None for any number.
         draw: draws the images, their tracks and paths (:func:`~aenerf_ns.pose_estimation.picture.draw_poses`), given
             the paths; None where the images were not kept.
@@ -75,6 +84,7 @@ class EstimatedPoses:
     images: str = "frames"
     mapper: str = "incremental"
     agreement: float | None = None
+    breaks: tuple[int, ...] = ()
     max_lost: int | None = None
     draw: Callable[[Mapping[str, NDArray[np.float64]]], Image.Image] | None = None
 
@@ -110,11 +120,12 @@ class EstimatedPoses:
             "seconds": self.seconds,
             "mapper": self.mapper,
             "agreement": self.agreement,
+            "breaks_ns": list(self.breaks),
             "summary": self.summary(),
         }
 
     def summary(self) -> str:
-        """Return a line of figures, and a second line that names the times of frames without a pose, if any."""
+        """Return a line of figures, a line that names the times of breaks, and one of frames without a pose, if any."""
         pieces = f" in the largest of {len(self.model_sizes)} models" if len(self.model_sizes) > 1 else ""
         line = (
             f"COLMAP: {len(self.trajectory)} of {len(self.frame_times)} {self.images} registered{pieces}, "
@@ -122,17 +133,26 @@ class EstimatedPoses:
         )
         if self.agreement is not None:
             line += f", {self.mapper} mapper; {self.agreement:.0%} of the matches that were kept apart fit the poses"
+        if self.breaks:
+            seconds = _shortened([f"{time * 1e-9:.3f}" for time in self.breaks])
+            line += (
+                f"\nThe path breaks after {', '.join(seconds)} s: two {self.images} that follow each other share no "
+                "points, or the camera turns at once. Parts may lie the wrong way round."
+            )
         gaps = [f"{start * 1e-9:.3f} to {end * 1e-9:.3f} s ({count})" for start, end, count in self.gaps()]
-        if len(gaps) > _MAX_GAPS_SHOWN:
-            gaps = [*gaps[:_MAX_GAPS_SHOWN], f"and {len(gaps) - _MAX_GAPS_SHOWN} more runs"]
         if gaps:
             longest = self.max_pose_gap()
             near = "" if longest is None else f" at most {longest * 1e-9:.3g} s apart"
             line += (
-                f"\nFrames without a pose: {', '.join(gaps)}. Between registered frames{near} poses are interpolated; "
-                "other events are not used."
+                f"\nFrames without a pose: {', '.join(_shortened(gaps))}. Between registered frames{near} poses are "
+                "interpolated; other events are not used."
             )
         return line
+
+
+def _shortened(items: list[str]) -> list[str]:
+    rest = len(items) - _MAX_SHOWN
+    return [*items[:_MAX_SHOWN], f"and {rest} more"] if rest > 0 else items
 
 
 def place_images(
@@ -201,6 +221,7 @@ def place_images(
         images=images,
         mapper=mapper,
         agreement=agreement,
+        breaks=tuple(times[breaks_of(model)].tolist()),
         max_lost=max_lost,
         draw=None if pictures is None else partial(draw_poses, pictures, observations_of(model, len(times))),
     )
@@ -241,7 +262,7 @@ def _refine(workspace: ColmapWorkspace, model: Any, num_images: int) -> Any:
     # (benchmarks/LOG.md).
     start = workspace.triangulate(poses, *_ROUNDS[-1][:2])
     more = adjust((workspace.reconstruct(start=start) or [model])[0], _ROUNDS[1:])
-    return more if is_placed(more) else model
+    return more if len(poses_of(more)) >= len(poses) else model
 
 
 def _is_sound(model: Any) -> bool:

@@ -8,7 +8,7 @@ import pytest
 from helpers.colmap_stand_in import model_of
 from scipy.spatial.transform import Rotation
 
-from aenerf_ns.pose_estimation.colmap_model import is_sound, poses_of, stand_upright
+from aenerf_ns.pose_estimation.colmap_model import breaks_of, is_sound, poses_of, stand_upright
 
 
 def test_frames_that_see_few_points_have_no_pose() -> None:
@@ -42,6 +42,7 @@ def test_a_model_is_sound(turn: float, pixels: float, sound: bool) -> None:
     for image in list(model.images.values())[3:]:
         image.cam_from_world = lambda: turned
     assert is_sound(model, 4.0) is sound
+    assert breaks_of(model) == ([2] if turn > 30 else [])
 
 
 @pytest.mark.parametrize(("shared", "turn", "has_pose"), [(20, 0.0, True), (0, 0.0, False), (20, 40.0, False)])
