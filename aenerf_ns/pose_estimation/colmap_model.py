@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -39,13 +38,16 @@ def _index(image: Any) -> int:
 
 def _linked(images: list[Any]) -> list[Any]:
     """Return the largest group of images that holds together: each shares enough points with another, and not with far
-    fewer than most do, and the path goes on from the image before it or to the one after it."""
-    links = _count_shared_points(images) >= MIN_POINTS
-    partners = np.asarray(links.sum(1)).ravel() - 1
-    goes_on = _goes_on(images)
-    is_held = np.append(goes_on, False) | np.append(False, goes_on)
+    fewer than most do, and with the image before or after it, and is not turned away from both."""
+    shared = _count_shared_points(images)
+    partners = np.asarray((shared >= MIN_POINTS).sum(1)).ravel() - 1
+    is_near = shared.diagonal(1) >= MIN_POINTS
+    is_held = np.append(is_near, False) | np.append(False, is_near)
+    turns = _turns(images, 1)
+    # A camera in fast motion turns far from image to image, but then farther still to the next but one.
+    is_held[1:-1] &= np.minimum(turns[:-1], turns[1:]) < np.maximum(_turns(images, 2), _MAX_TURN)
     held = np.flatnonzero(is_held & (partners >= min(_SHARE * np.median(partners), _ENOUGH_PARTNERS)))
-    groups = connected_components(links[held][:, held])[1]
+    groups = connected_components((shared >= MIN_POINTS)[held][:, held])[1]
     return [images[i] for i in held[groups == np.bincount(groups).argmax()]] if len(held) else []
 
 
@@ -58,13 +60,10 @@ def _count_shared_points(images: list[Any]) -> csr_array:
     return sees @ sees.T
 
 
-def _goes_on(images: list[Any]) -> NDArray[np.bool_]:
-    """Return whether the path goes on from each image to the next, (N - 1): both see some of the same points, and the
-    camera turns little."""
+def _turns(images: list[Any], step: int) -> NDArray[np.float64]:
+    """Return the degrees that the camera turns from each image to the one that many images later."""
     rotations = [image.cam_from_world().rotation for image in images]
-    turns = [first.angle_to(second) for first, second in pairwise(rotations)]
-    limits = np.deg2rad(_MAX_TURN) * np.diff([_index(image) for image in images])
-    return (_count_shared_points(images).diagonal(1) >= MIN_POINTS) & (np.array(turns) < limits)
+    return np.rad2deg([first.angle_to(second) for first, second in zip(rotations, rotations[step:], strict=False)])
 
 
 def poses_of(model: Any, only_linked: bool = True) -> dict[int, NDArray[np.float64]]:
@@ -73,7 +72,7 @@ def poses_of(model: Any, only_linked: bool = True) -> dict[int, NDArray[np.float
     Args:
         model: COLMAP's. Frames that see fewer than MIN_POINTS points have no pose.
         only_linked: neither have frames that share as many with too few others, or with neither of the frames before
-            and after them, or turn far from both: they, or their group, may lie anywhere.
+            and after them, or are turned away from both: they, or their group, may lie anywhere.
     """
     return {_index(image): image.cam_from_world().inverse().matrix() for image in placed_images(model, only_linked)}
 
@@ -90,15 +89,20 @@ def is_sound(model: Any, max_pixels: float) -> bool:
     one part ends and the next begins, frames that follow each other share no points, or the camera turns at once.
     """
     images = placed_images(model)
-    is_near = model.compute_mean_reprojection_error() < max_pixels
-    return bool(is_near and len(images) > 1 and _goes_on(images).all())
+    if len(images) < 2 or model.compute_mean_reprojection_error() >= max_pixels or _breaks(images).any():
+        return False
+    return not any(_turns(images, 1)[np.diff([_index(image) for image in images]) == 1] >= _MAX_TURN)
 
 
 def breaks_of(model: Any) -> list[int]:
-    """Return the indices of frames that have a pose, as the next frame has, but whose path does not go on to it."""
+    """Return the indices of frames that have a pose, as the next frame has, but share few points with it."""
     images = placed_images(model)
     indices = np.array([_index(image) for image in images])
-    return indices[:-1][~_goes_on(images) & (np.diff(indices) == 1)].tolist()
+    return indices[:-1][_breaks(images) & (np.diff(indices) == 1)].tolist()
+
+
+def _breaks(images: list[Any]) -> NDArray[np.bool_]:
+    return _count_shared_points(images).diagonal(1) < MIN_POINTS
 
 
 def stand_upright(model: Any) -> None:

@@ -19,6 +19,7 @@ from aenerf_ns.camera.time_window import runs_of
 from aenerf_ns.camera.trajectory import Trajectory
 from aenerf_ns.errors import DataError
 from aenerf_ns.pose_estimation.colmap_model import (
+    MIN_POINTS,
     breaks_of,
     is_placed,
     is_sound,
@@ -136,8 +137,8 @@ class EstimatedPoses:
         if self.breaks:
             seconds = _shortened([f"{time * 1e-9:.3f}" for time in self.breaks])
             line += (
-                f"\nThe path breaks after {', '.join(seconds)} s: two {self.images} that follow each other share no "
-                "points, or the camera turns at once. Parts may lie the wrong way round."
+                f"\nThe path breaks after {', '.join(seconds)} s: two {self.images} that follow each other share fewer "
+                f"than {MIN_POINTS} points. Parts may lie the wrong way round."
             )
         gaps = [f"{start * 1e-9:.3f} to {end * 1e-9:.3f} s ({count})" for start, end, count in self.gaps()]
         if gaps:

@@ -28,7 +28,7 @@ def model_of(*seen: range) -> SimpleNamespace:
         )
         for index, points in enumerate(seen)
     }
-    return SimpleNamespace(images=images)
+    return SimpleNamespace(images=images, compute_mean_reprojection_error=lambda: 0.5)
 
 
 def place_frames(num_placed: int, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -11,6 +11,10 @@ from scipy.spatial.transform import Rotation
 from aenerf_ns.pose_estimation.colmap_model import breaks_of, is_sound, poses_of, stand_upright
 
 
+def turned_by(degrees: float) -> pycolmap.Rigid3d:
+    return pycolmap.Rigid3d(pycolmap.Rotation3d([0, np.deg2rad(degrees), 0]), [0, 0, 0])
+
+
 def test_frames_that_see_few_points_have_no_pose() -> None:
     assert list(poses_of(model_of(*map(range, [14, 15, 15, 15])))) == [1, 2, 3]
 
@@ -38,20 +42,31 @@ def test_a_model_is_sound(turn: float, pixels: float, sound: bool) -> None:
     model = model_of(*[range(100)] * 6)
     model.compute_mean_reprojection_error = lambda: pixels
     # The second half looks another way.
-    turned = pycolmap.Rigid3d(pycolmap.Rotation3d([0, np.deg2rad(turn), 0]), [0, 0, 0])
     for image in list(model.images.values())[3:]:
-        image.cam_from_world = lambda: turned
+        image.cam_from_world = lambda: turned_by(turn)
     assert is_sound(model, 4.0) is sound
-    assert breaks_of(model) == ([2] if turn > 30 else [])
 
 
 @pytest.mark.parametrize(("shared", "turn", "has_pose"), [(20, 0.0, True), (0, 0.0, False), (20, 40.0, False)])
 def test_a_frame_apart_from_those_before_and_after_it_has_no_pose(shared: int, turn: float, has_pose: bool) -> None:
     # Frames of another time see what it sees, too.
     model = model_of(*[range(100)] * 4, range(100 - shared, 200), *[range(100)] * 4, *[range(80, 200)] * 6)
-    turned = pycolmap.Rigid3d(pycolmap.Rotation3d([0, np.deg2rad(turn), 0]), [0, 0, 0])
-    model.images[4].cam_from_world = lambda: turned
+    model.images[4].cam_from_world = lambda: turned_by(turn)
     assert (4 in poses_of(model)) == has_pose
+
+
+def test_a_camera_in_fast_motion_has_poses() -> None:
+    model = model_of(*[range(100)] * 5)
+    for index, image in model.images.items():
+        image.cam_from_world = lambda angle=40.0 * index: turned_by(angle)
+    assert len(poses_of(model)) == 5
+
+
+def test_a_path_breaks_where_frames_share_no_points() -> None:
+    # The last frames come back to what the first ones see.
+    whole, torn = (model_of(*[range(100)] * 6, *[range(first, 200)] * 6, *[range(200)] * 2) for first in (80, 100))
+    assert (is_sound(whole, 4.0), breaks_of(whole)) == (True, [])
+    assert (is_sound(torn, 4.0), breaks_of(torn)) == (False, [5])
 
 
 def test_worlds_stand_upright(monkeypatch: pytest.MonkeyPatch) -> None:
