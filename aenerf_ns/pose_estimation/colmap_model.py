@@ -86,7 +86,8 @@ def is_sound(model: Any, max_pixels: float) -> bool:
     """Return whether a model's mean error of reprojection is small, and its path has no break.
 
     A mapper may throw frames far out where it sees nothing, and join parts that look alike the wrong way round. Where
-    one part ends and the next begins, frames that follow each other share no points, or the camera turns at once.
+    one part ends and the next begins, frames that follow each other, also across lost ones, share few points, or the
+    camera turns at once.
     """
     images = placed_images(model)
     if len(images) < 2 or model.compute_mean_reprojection_error() >= max_pixels or _breaks(images).any():

@@ -199,7 +199,8 @@ def place_images(
         models[mapper] = _refine(workspace, model, len(times)) if adjusted else model
         if _is_sound(models[mapper]):
             break
-    mapper = max(models, key=lambda one: (is_placed(models[one]), _is_sound(models[one])), default="")
+    sound = _sound(models)
+    mapper = max(models, key=lambda one: (is_placed(models[one]), sound[one]), default="")
     if camera is None or not mapper or not is_placed(models[mapper]):
         problem = f"they have {features:.0f} features (median), and {pairs} pairs of {images} match"
         raise DataError(source, f"COLMAP places none of {len(times)} {images}: {problem}", remedy)
@@ -231,7 +232,7 @@ def place_images(
 def _map_images(workspace: ColmapWorkspace, adjusted: bool) -> dict[str, list[Any]]:
     """Return the models of the mappers that are asked, the largest first, and the mapper that fits better first."""
     found: dict[str, list[Any]] = {}
-    fits: dict[str, tuple[bool, float]] = {}
+    shares: dict[str, float] = {}
     mappers: dict[str, Callable[[], list[Any]]] = {"incremental": workspace.reconstruct}
     if adjusted:
         workspace.hold_out_matches(_HELD_OUT)
@@ -242,10 +243,12 @@ def _map_images(workspace: ColmapWorkspace, adjusted: bool) -> dict[str, list[An
         if models:
             found[mapper] = models
             share = workspace.agreement(models[0]) or 0.0
-            fits[mapper] = _is_sound(models[0]), share + (_GLOBAL_LEAD if mapper == "global" else 0.0)
-            if fits[mapper] >= (True, _GOOD_FIT):
+            shares[mapper] = share + (_GLOBAL_LEAD if mapper == "global" else 0.0)
+            if shares[mapper] >= _GOOD_FIT and _is_sound(models[0]):
                 break
-    return {mapper: found[mapper] for mapper in sorted(fits, key=fits.__getitem__, reverse=True)}
+    sound = _sound({mapper: models[0] for mapper, models in found.items()})
+    order = sorted(found, key=lambda mapper: (sound[mapper], shares[mapper]), reverse=True)
+    return {mapper: found[mapper] for mapper in order}
 
 
 def _refine(workspace: ColmapWorkspace, model: Any, num_images: int) -> Any:
@@ -264,6 +267,12 @@ def _refine(workspace: ColmapWorkspace, model: Any, num_images: int) -> Any:
     start = workspace.triangulate(poses, *_ROUNDS[-1][:2])
     more = adjust((workspace.reconstruct(start=start) or [model])[0], _ROUNDS[1:])
     return more if len(poses_of(more)) >= len(poses) else model
+
+
+def _sound(models: Mapping[str, Any]) -> dict[str, bool]:
+    """Return which models have no fault: a fragment of the path has none because it is short, and does not count."""
+    sizes = {mapper: len(poses_of(model)) for mapper, model in models.items()}
+    return {mapper: 2 * sizes[mapper] >= max(sizes.values()) and _is_sound(model) for mapper, model in models.items()}
 
 
 def _is_sound(model: Any) -> bool:

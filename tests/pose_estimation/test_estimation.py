@@ -14,6 +14,7 @@ import numpy as np
 import pycolmap
 import pytest
 import torch
+from helpers.colmap_stand_in import model_of
 from nerfstudio.utils.rich_utils import CONSOLE
 from PIL import Image
 
@@ -35,7 +36,7 @@ from aenerf_ns.pose_estimation.colmap_workspace import ColmapWorkspace, work_fol
 from aenerf_ns.pose_estimation.from_events import estimate_poses_from_events
 from aenerf_ns.pose_estimation.from_frames import compare_with_truth, estimate_poses
 from aenerf_ns.pose_estimation.picture import draw_poses
-from aenerf_ns.pose_estimation.placement import EstimatedPoses
+from aenerf_ns.pose_estimation.placement import EstimatedPoses, _sound
 from aenerf_ns.recording.recording import ReferenceView
 from aenerf_ns.recording.scene import SCENE_KEY
 from aenerf_ns.recording.views import move_views
@@ -207,6 +208,18 @@ def test_images_that_a_mapper_lost_are_placed_again(dataset: Path, monkeypatch: 
     errors = pose_errors(found.trajectory.camera_to_worlds, recording.ground_truth.interpolate(found.frame_times))
     # Measured: 0.6 degrees, on half of the path.
     assert errors["rotation_error_degrees"] < 2
+
+
+def test_a_fragment_does_not_count_as_sound() -> None:
+    # The whole path has a gap, across which nothing is shared.
+    whole, fragment = (
+        model_of(*[range(100)] * 20, *[range(100, 200)] * 20, *[range(200)] * 10),
+        model_of(*[range(100)] * 5),
+    )
+    for index, image in list(whole.images.items())[20:]:
+        image.name = f"{index + 10:08d}.png"
+    assert _sound({"global": whole, "incremental": fragment}) == {"global": False, "incremental": False}
+    assert _sound({"incremental": fragment}) == {"incremental": True}
 
 
 def test_an_interrupted_search_goes_on(
