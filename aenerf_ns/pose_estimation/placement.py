@@ -135,9 +135,9 @@ class EstimatedPoses:
         if self.agreement is not None:
             line += f", {self.mapper} mapper; {self.agreement:.0%} of the matches that were kept apart fit the poses"
         if self.breaks:
-            seconds = _shortened([f"{time * 1e-9:.3f}" for time in self.breaks])
+            times = _shortened([f"{time * 1e-9:.3f} s" for time in self.breaks], "times")
             line += (
-                f"\nThe path breaks after {', '.join(seconds)} s: two {self.images} that follow each other share fewer "
+                f"\nThe path breaks after {times}: two {self.images} that follow each other share fewer "
                 f"than {MIN_POINTS} points. Parts may lie the wrong way round."
             )
         gaps = [f"{start * 1e-9:.3f} to {end * 1e-9:.3f} s ({count})" for start, end, count in self.gaps()]
@@ -145,15 +145,15 @@ class EstimatedPoses:
             longest = self.max_pose_gap()
             near = "" if longest is None else f" at most {longest * 1e-9:.3g} s apart"
             line += (
-                f"\nFrames without a pose: {', '.join(_shortened(gaps))}. Between registered frames{near} poses are "
+                f"\nFrames without a pose: {_shortened(gaps, 'runs')}. Between registered frames{near} poses are "
                 "interpolated; other events are not used."
             )
         return line
 
 
-def _shortened(items: list[str]) -> list[str]:
+def _shortened(items: list[str], name: str) -> str:
     rest = len(items) - _MAX_SHOWN
-    return [*items[:_MAX_SHOWN], f"and {rest} more"] if rest > 0 else items
+    return ", ".join([*items[:_MAX_SHOWN], f"and {rest} more {name}"] if rest > 0 else items)
 
 
 def place_images(

@@ -482,10 +482,10 @@ def test_report_lost_frames_and_fragments(truth: torch.Tensor) -> None:
     many = Trajectory(FRAME * np.arange(0, 40, 2), truth[:20])
     told = dataclasses.replace(found, frame_times=FRAME * np.arange(40), trajectory=many).summary()
     assert told.count("(1)") == 10
-    assert "and 10 more" in told
+    assert "and 10 more runs" in told
     torn = dataclasses.replace(found, breaks=(FRAME, 5 * FRAME))
     assert torn.report()["breaks_ns"] == [FRAME, 5 * FRAME]
-    assert "The path breaks after 0.040, 0.200 s" in torn.summary()
+    assert "The path breaks after 0.040 s, 0.200 s: two frames" in torn.summary()
     whole = dataclasses.replace(found, frame_times=times[[1, 2, 5, 6, 8]], model_sizes=[5])
     assert whole.gaps() == []
     assert "\n" not in whole.summary()
