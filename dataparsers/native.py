@@ -66,8 +66,8 @@ class NativeDataParser(EventDataParser):
 
     def read_capture(self) -> tuple[Capture, list[tuple[int, Path]]]:
         path, meta, capture = self._read_all_but_poses()
-        timed = {frame.timestamp: frame.file_path for frame in meta.frames if frame.timestamp is not None}
-        return capture, [(time, file_inside(path.parent, name, path)) for time, name in sorted(timed.items())]
+        timed = [(frame.timestamp, frame.file_path) for frame in meta.frames if frame.timestamp is not None]
+        return capture, [(time, file_inside(path.parent, name, path)) for time, name in timed]
 
     def _read_all_but_poses(self) -> tuple[Path, Transforms, Capture]:
         """Return transforms.json, its content, and the cameras."""

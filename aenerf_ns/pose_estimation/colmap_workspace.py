@@ -176,9 +176,10 @@ class ColmapWorkspace:
         model = models[0]
         for limits in rounds:
             self._store_intrinsics(model)
-            model = self.adjust(model, *limits, refine_intrinsics=True)
-            if not is_placed(model):
-                return None
+            adjusted = self.adjust(model, *limits, refine_intrinsics=True)
+            if not is_placed(adjusted):
+                break
+            model = adjusted
         self._store_intrinsics(model)
         with pycolmap.Database.open(self._database) as database:
             database.clear_two_view_geometries()

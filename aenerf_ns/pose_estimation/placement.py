@@ -266,7 +266,8 @@ def _refine(workspace: ColmapWorkspace, model: Any, num_images: int) -> Any:
     # (benchmarks/LOG.md).
     start = workspace.triangulate(poses, *_ROUNDS[-1][:2])
     more = adjust((workspace.reconstruct(start=start) or [model])[0], _ROUNDS[1:])
-    return more if len(poses_of(more)) >= len(poses) else model
+    is_better = len(poses_of(more)) >= len(poses) and (_is_sound(more) or not _is_sound(model))
+    return more if is_better else model
 
 
 def _sound(models: Mapping[str, Any]) -> dict[str, bool]:

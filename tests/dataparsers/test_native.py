@@ -54,6 +54,16 @@ def test_frame_without_pose_gets_that_of_its_time(native: Path) -> None:
     torch.testing.assert_close(pose, (expected @ OPENCV_TO_OPENGL)[:3].float(), rtol=0, atol=1e-6)
 
 
+def test_frames_of_one_time_are_refused_where_poses_are_missing(native: Path) -> None:
+    meta = json.loads((native / "transforms.json").read_text())
+    for frame in meta["frames"]:
+        frame["timestamp"] = 7.5
+    (native / "transforms.json").write_text(json.dumps(meta))
+    (native / "trajectory_estimated.txt").unlink()
+    with pytest.raises(DataError, match=r"several images are at 7\.500000000 s; give each image its own time"):
+        NativeDataParserConfig(data=native).setup().read_frames()
+
+
 def test_options_replace_values_of_the_sensor(native: Path) -> None:
     options = {"positive_contrast_threshold": 0.7, "refractory_period_ns": 0, "bandwidth_hz": 0.0}
     scene = parse(NativeDataParserConfig(data=native, **options)).metadata[SCENE_KEY]
