@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from copy import deepcopy
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +14,6 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from aenerf_ns.dataparsers import ecd, eds, enerf_esim, eventnerf, native, own_recording, paev3d, robust_enerf, tum_vie
 from aenerf_ns.errors import DataError, reading
 from aenerf_ns.files.output_paths import require_dataset
-from aenerf_ns.recording.dataparser import EventDataParser
 from aenerf_ns.recording.options import EventDataParserConfig
 
 # All formats by registered name. Where a folder has several formats, the first one here is taken.
@@ -70,8 +69,6 @@ def _format_of(data: Path) -> str | None:
 @dataclass
 class AutomaticDataParserConfig(DataParserConfig):
     """A recording in any known format. To set a format's options, name the format."""
-
-    _target: type = field(default_factory=lambda: EventDataParser)
 
     def setup(self, **kwargs: Any) -> Any:
         """Make the dataparser of the format of ``data``, with that format's default configuration.

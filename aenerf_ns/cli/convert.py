@@ -133,10 +133,9 @@ class Convert(DatasetCommand):
                 recording = replace(recording, max_pose_gap=parser.config.max_pose_gap_ns)
         trajectory = _cut(recording, filters.window)
         views = views_to_copy(recording, filters.window)
-        camera = recording.event_camera
         if self.region is not None:
-            camera = camera.crop(*self.region)
-        with open_writer(lock, parser, recording, camera, recording.frame_camera, has_given_poses) as writer:
+            recording = replace(recording, event_camera=recording.event_camera.crop(*self.region))
+        with open_writer(lock, parser, recording, has_given_poses) as writer:
             writer.add_trajectories(trajectory, recording.ground_truth)
             if report is None:
                 writer.copy_poses_report(trajectory)

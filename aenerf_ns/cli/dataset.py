@@ -19,7 +19,6 @@ from aenerf_ns.files.output_paths import require_dataset
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from aenerf_ns.camera.intrinsics import CameraIntrinsics
     from aenerf_ns.camera.time_window import TimeWindow
     from aenerf_ns.recording.dataparser import EventDataParser
     from aenerf_ns.recording.options import EventDataParserConfig
@@ -103,12 +102,7 @@ def _with_options(
 
 
 def open_writer(
-    lock: OutputLock,
-    parser: EventDataParser,
-    recording: Recording,
-    event_camera: CameraIntrinsics,
-    frame_camera: CameraIntrinsics,
-    has_metric_poses: bool = True,
+    lock: OutputLock, parser: EventDataParser, recording: Recording, has_metric_poses: bool = True
 ) -> NativeDatasetWriter:
     """Open a dataset folder for what a command makes of a recording, in the world of the recording.
 
@@ -118,12 +112,12 @@ def open_writer(
 
     return NativeDatasetWriter(
         lock,
-        event_camera,
+        recording.event_camera,
         recording.sensor,
         recording.image_encoding,
         scene_box=recording.scene_box,
         max_pose_gap=recording.max_pose_gap,
-        frame_camera=frame_camera,
+        frame_camera=recording.frame_camera,
         frame_from_event=recording.frame_from_event,
         # Near and far planes keep their units.
         auto_scale_poses=parser.scales_poses(recording) or not has_metric_poses,

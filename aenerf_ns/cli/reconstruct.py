@@ -60,10 +60,9 @@ class Reconstruct(DatasetCommand):
 
         recording = parser.recording
         source = self._source(recording)
-        camera = recording.event_camera
         # The images are made of the events, and are the event camera's own.
-        made_by_events = replace(recording, frame_from_event=None)
-        with open_writer(lock, parser, made_by_events, camera, camera) as writer:
+        made_by_events = replace(recording, frame_camera=recording.event_camera, frame_from_event=None)
+        with open_writer(lock, parser, made_by_events) as writer:
             writer.add_trajectories(recording.trajectory, recording.ground_truth)
             writer.copy_poses_report(recording.trajectory)
             _add_reference_views(recording, writer)

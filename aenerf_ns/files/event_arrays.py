@@ -83,12 +83,8 @@ def read_npz_member(path: Path, name: str) -> NDArray:
                 # The local header has a name and an extra field of other lengths (PKZIP's APPNOTE, 4.3.7).
                 file.seek(entry.header_offset + 26)
                 begin = entry.header_offset + 30 + sum(struct.unpack("<HH", file.read(4)))
-            return _map(path, begin + member.tell(), shape, order, dtype)
-        num_bytes = math.prod(shape) * dtype.itemsize
-        values = np.frombuffer(member.read(num_bytes), np.uint8)
-        if len(values) < num_bytes:
-            raise ValueError("it ends too early")
-        return np.ndarray(shape, dtype, values, order=order)
+            return np.memmap(path, dtype, "r", begin + member.tell(), shape, order)
+        return np.ndarray(shape, dtype, member.read(math.prod(shape) * dtype.itemsize), order=order)
 
 
 @contextmanager
@@ -116,7 +112,7 @@ def load_npy(path: Path) -> NDArray:
     """
     with bounded(path, ".npy file"), path.open("rb") as file:
         shape, order, dtype = _read_plain_header(file, path.stat().st_size)
-        return _map(path, file.tell(), shape, order, dtype)
+        return np.memmap(path, dtype, "r", file.tell(), shape, order)
 
 
 def read_npy_header(file: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype]:
@@ -137,8 +133,3 @@ def _read_plain_header(file: IO[bytes], size: int) -> tuple[tuple[int, ...], Lit
     if not is_valid or not 0 <= math.prod(shape) * dtype.itemsize <= size - file.tell():
         raise ValueError(f"its shape is {shape}, but it has {size:,} bytes")
     return shape, "F" if is_fortran else "C", dtype
-
-
-def _map(path: Path, begin: int, shape: tuple[int, ...], order: Literal["C", "F"], dtype: np.dtype) -> NDArray:
-    is_empty = math.prod(shape) * dtype.itemsize == 0
-    return np.zeros(shape, dtype) if is_empty else np.memmap(path, dtype, "r", begin, shape, order)

@@ -180,10 +180,8 @@ def viewer_cameras(trajectory: Trajectory, views: list[ReferenceView]) -> tuple[
 
 def seconds_on_trajectory(views: list[ReferenceView], trajectory: Trajectory) -> Tensor:
     """Return when views were taken: (N, 1) float64 seconds since the trajectory's start, NaN for untimed views."""
-    times = torch.tensor([[trajectory.start if view.time is None else view.time] for view in views])
-    seconds = trajectory.seconds(times.reshape(-1, 1))
-    seconds[[view.time is None for view in views]] = torch.nan
-    return seconds
+    times = [torch.nan if view.time is None else (view.time - trajectory.start) * 1e-9 for view in views]
+    return torch.tensor(times, dtype=torch.float64)[:, None]
 
 
 def spread_evenly(items: Sequence[Item], max_items: int) -> list[Item]:
