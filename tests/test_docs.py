@@ -1,7 +1,5 @@
 """The documentation names options, files and pages that exist."""
 
-from __future__ import annotations
-
 import re
 import runpy
 from pathlib import Path

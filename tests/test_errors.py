@@ -1,7 +1,5 @@
 """The error for bad input."""
 
-from __future__ import annotations
-
 from aenerf_ns.errors import DataError
 
 

@@ -1,7 +1,5 @@
 """How the project is laid out: which folder may use which, and what stands where."""
 
-from __future__ import annotations
-
 import graphlib
 import re
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """What is installed: the wheel, what it depends on, the entry points, and the cost of importing the package."""
 
-from __future__ import annotations
-
 import email.message
 import os
 import re

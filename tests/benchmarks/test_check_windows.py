@@ -1,7 +1,5 @@
 """The windows that ``aenerf check`` is measured on: a right one has no problem, and a mistake in one is counted."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from helpers.commands import simulate

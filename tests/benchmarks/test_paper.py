@@ -1,7 +1,5 @@
 """The paper's tables: the plan, the tables against hand-made figures, and a whole small benchmark by the command."""
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess

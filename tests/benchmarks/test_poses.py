@@ -1,7 +1,5 @@
 """The measures and the table of the benchmark of the correction of poses."""
 
-from __future__ import annotations
-
 import json
 import math
 from pathlib import Path

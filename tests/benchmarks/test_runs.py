@@ -1,7 +1,5 @@
 """Commands of benchmarks: they end with the process that started them, and what fails is said in one line."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import signal

@@ -1,7 +1,5 @@
 """The cost of training steps: a small comparison by the command."""
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess

@@ -1,7 +1,5 @@
 """Pixel directions against OpenCV's projection and against the framework's own rays."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 import pytest

@@ -1,7 +1,5 @@
 """Time windows with gaps, against brute force over every nanosecond."""
 
-from __future__ import annotations
-
 from itertools import pairwise
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Rotations, poses in continuous time, and pose noise."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The check of a dataset: true poses beat wrong poses, and a planted mistake is named."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """The bandwidth of a sensor, from its events and the frames between which they lie."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from types import SimpleNamespace
 

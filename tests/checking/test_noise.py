@@ -1,7 +1,5 @@
 """The bound of the noise, against simulated noise."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

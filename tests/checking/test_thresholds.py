@@ -1,7 +1,5 @@
 """The ratio of the contrast thresholds, against that of simulated sensors."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from helpers.streams import EventsInMemory, make_stream

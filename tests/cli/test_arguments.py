@@ -1,7 +1,5 @@
 """The arguments of ``aenerf``: what they are parsed to, and that mistakes in them are reported at once."""
 
-from __future__ import annotations
-
 import io
 import os
 import subprocess

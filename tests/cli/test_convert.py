@@ -1,7 +1,5 @@
 """Converting to the native format: only what the options ask for changes, and nothing is left half-written."""
 
-from __future__ import annotations
-
 import json
 import signal
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """``aenerf reconstruct``: a dataset of reconstructed images, which this project and Nerfstudio read."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import imageio_ffmpeg

@@ -1,7 +1,5 @@
 """``aenerf simulate-video``: the dataset that a video becomes with poses, with COLMAP's, and without any."""
 
-from __future__ import annotations
-
 import json
 import sys
 from dataclasses import replace
@@ -183,13 +181,6 @@ def test_the_filters_of_a_color_sensor_belong_into_its_calibration(frames: Path,
     assert '"bayer_pattern": "GRBG", ' in printed
 
 
-def test_frame_of_another_size_leaves_nothing(frames: Path, tmp_path: Path) -> None:
-    Image.fromarray(np.zeros((5, 5), np.uint8)).save(frames / "7.png")
-    with pytest.raises(DataError, match="frame 7 has 5 x 5 pixels"):
-        simulate(tmp_path / "made" / "dataset", video=frames)
-    assert list((tmp_path / "made").iterdir()) == []
-
-
 LENS = {"intrinsics": (20.0, 21.0, 11.5, 7.5)}
 
 
@@ -213,7 +204,7 @@ def test_contradicting_options_are_refused(
     paths = {"trajectory": poses, "calibration": camchain}
     with pytest.raises(DataError, match=message):
         simulate(tmp_path / "out", video=frames, **{name: paths[name] for name in files}, **options)
-    assert not (tmp_path / "out").exists()
+    assert not list(tmp_path.glob("*out*"))
 
 
 def test_a_calibration_without_a_lens_is_refused(frames: Path, tmp_path: Path) -> None:

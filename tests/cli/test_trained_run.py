@@ -1,7 +1,5 @@
 """What a config.yml may name, before it is opened."""
 
-from __future__ import annotations
-
 import shutil
 from collections.abc import Callable
 from dataclasses import replace

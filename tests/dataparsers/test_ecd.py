@@ -1,13 +1,11 @@
 """The text format of the Event Camera Dataset."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest
 import torch
 from helpers.small_datasets import parse
-from helpers.unpacked_pairs import unpacked
+from helpers.streams import unpacked
 
 from aenerf_ns.camera.metadata_keys import REFERENCE_SECONDS
 from aenerf_ns.camera.noise import perturb

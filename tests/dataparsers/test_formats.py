@@ -1,7 +1,5 @@
 """Every published format is recognized and read exactly, and converts to the native format unchanged."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

@@ -1,8 +1,6 @@
 """Malformed datasets of every format, and recordings that unpack to far more than they hold: one clear line each, in
 little memory and time. A search breaks one value or file of a whole dataset at a time."""
 
-from __future__ import annotations
-
 import json
 import os
 import shutil

@@ -1,7 +1,5 @@
 """The native dataset format."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

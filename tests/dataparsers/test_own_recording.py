@@ -1,7 +1,5 @@
 """The user's own recording: events, calibration and poses from any source."""
 
-from __future__ import annotations
-
 import json
 import struct
 from decimal import Decimal
@@ -136,14 +134,6 @@ def test_a_recording_may_be_given_by_its_event_file(truth: Truth) -> None:
     # As where a trained run is opened.
     file.unlink()
     assert recording_of(config).event_file.path == file
-
-
-def test_refuse_the_event_file_of_another_format(tmp_path: Path) -> None:
-    for name in ("events.txt", "calib.txt"):
-        (tmp_path / name).touch()
-    message = r"events.txt: it belongs to a recording in the format ecd-data; give the folder"
-    with pytest.raises(DataError, match=message):
-        recognize(tmp_path / "events.txt")
 
 
 def test_an_event_file_that_states_its_size_is_enough(tmp_path: Path) -> None:

@@ -1,7 +1,5 @@
 """What TUM-VIE, EDS and the formats of EventNeRF, PAEv3D and Robust e-NeRF each have alone."""
 
-from __future__ import annotations
-
 import json
 import os
 import shutil
@@ -18,7 +16,6 @@ from helpers.published_datasets import (
     EPOCH,
     assert_same_poses,
     config_of,
-    interpolated,
     make_poses,
     recording_of,
     tum_vie_matrix,
@@ -29,7 +26,7 @@ from helpers.published_datasets import (
     write_tum_vie,
 )
 from helpers.small_datasets import parse
-from helpers.unpacked_pairs import unpacked
+from helpers.streams import unpacked
 
 from aenerf_ns.camera.intrinsics import CameraIntrinsics
 from aenerf_ns.camera.trajectory import Trajectory
@@ -52,7 +49,7 @@ def test_eds_views_are_those_of_the_frame_camera(tmp_path: Path) -> None:
     view = given.reference_views["train"][1]
     assert view.time == (EPOCH + 800_000) * 1_000
     # Kalibr's matrix takes points from the frame camera to the event camera.
-    expected = interpolated(truth, view.time) @ make_poses(3)[2]
+    expected = truth.poses[truth.times == view.time][0] @ make_poses(3)[2]
     np.testing.assert_allclose(view.camera_to_world.numpy(), expected, rtol=0, atol=1e-9)
 
 
@@ -124,7 +121,9 @@ def test_choose_one_of_several_scenes(tmp_path: Path, monkeypatch: pytest.Monkey
     assert recording_of(PAEv3DDataParserConfig(data=one)).event_file.path.parent == one
     monkeypatch.chdir(one)
     assert recognize(Path()) == "paev3d-data"
-    with pytest.raises(DataError, match=r"event.h5: it belongs to a recording in the format paev3d-data"):
+    with pytest.raises(
+        DataError, match=r"event.h5: it belongs to a recording in the format paev3d-data; give the folder"
+    ):
         recognize(Path("event.h5"))
 
 
@@ -190,7 +189,7 @@ def test_tum_vie_views_are_those_of_the_frame_camera(tmp_path: Path, tum_vie_cal
 
     for view, time in zip(recording.reference_views["train"], (100_000, 333_333, 1_900_000), strict=True):
         assert view.time == (EPOCH + time) * 1_000
-        expected = interpolated(truth, view.time) @ np.linalg.inv(imu_from_event) @ imu_from_frame
+        expected = truth.poses[truth.times == view.time][0] @ np.linalg.inv(imu_from_event) @ imu_from_frame
         np.testing.assert_allclose(view.camera_to_world.numpy(), expected, rtol=0, atol=1e-9)
     assert recording.frame_camera.width == recording.frame_camera.height == 1024
     assert recording.frame_camera.cx == cameras["intrinsics"][0]["intrinsics"]["cx"] + 0.5

@@ -1,7 +1,5 @@
 """Event streams, pairing, the sensor model and event pictures."""
 
-from __future__ import annotations
-
 import tempfile
 from dataclasses import fields
 from itertools import pairwise
@@ -10,8 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from helpers.streams import EventsInMemory, make_stream, sorted_rows
-from helpers.unpacked_pairs import unpacked
+from helpers.streams import EventsInMemory, make_stream, sorted_rows, unpacked
 from hypothesis import given, settings
 from hypothesis import strategies as st
 

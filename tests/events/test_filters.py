@@ -1,11 +1,8 @@
 """Event filters: the same as the slow and obvious way, however the stream is cut."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
-from helpers.streams import EventsInMemory, make_stream, sorted_rows
-from helpers.unpacked_pairs import unpacked
+from helpers.streams import EventsInMemory, make_stream, sorted_rows, unpacked
 from hypothesis import given, settings
 from hypothesis import strategies as st
 

@@ -1,7 +1,5 @@
 """The optical flow of events against motions that are known."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from helpers.streams import make_stream

@@ -1,7 +1,5 @@
 """The drift of pixels tells how their thresholds differ, and nothing where they do not."""
 
-from __future__ import annotations
-
 from functools import cache
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The events of a table of pairs and of a stream, in the order of time, and their counts between two times."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

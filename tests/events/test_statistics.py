@@ -1,7 +1,5 @@
 """Statistics of a stream of events."""
 
-from __future__ import annotations
-
 from itertools import pairwise
 
 import numpy as np

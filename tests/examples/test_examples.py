@@ -1,7 +1,5 @@
 """The examples and the code in the documents run and do what the text says."""
 
-from __future__ import annotations
-
 import json
 import re
 import runpy

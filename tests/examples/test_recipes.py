@@ -1,7 +1,5 @@
 """The scripts that make recordings of published datasets, on small files of their layouts. JSON is YAML too."""
 
-from __future__ import annotations
-
 import json
 import struct
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Cameras for other trainers: read back by pycolmap and by the framework's own dataparsers."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial

@@ -1,7 +1,5 @@
 """Predictions and results in the layout of nerfbaselines."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Where exported cameras are, when they are, and what mesh the depths make."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from itertools import count
 from pathlib import Path

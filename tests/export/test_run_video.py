@@ -1,7 +1,5 @@
 """Events between the frames of a video."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from helpers.streams import EventsInMemory, random_stream

@@ -1,7 +1,5 @@
 """Events in HDF5: the native file and those of other projects."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import h5py

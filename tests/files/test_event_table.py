@@ -1,7 +1,5 @@
 """Tables of events: every layout of NumPy's files, HDF5, CSV and text, and columns of any numeric type."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Text files of events: the Event Camera Dataset's, and CSV."""
 
-from __future__ import annotations
-
 from decimal import Decimal, InvalidOperation
 from pathlib import Path
 

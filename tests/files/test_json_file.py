@@ -1,7 +1,5 @@
 """JSON files that a struct describes: exact numbers, and one clear line for everything else."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated, Literal
 

@@ -1,7 +1,5 @@
 """A few malformed events, which can be left out: they are counted and named, and the others are read as they are."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The limits within which files are read."""
 
-from __future__ import annotations
-
 import resource
 from pathlib import Path
 
@@ -62,12 +60,6 @@ def test_limits_hold_while_an_item_is_read(tmp_path: Path) -> None:
         assert resource.getrlimit(resource.RLIMIT_DATA) == before
     assert len(inside) == 2
     assert before not in inside
-
-
-def test_hidden_files_are_no_data(tmp_path: Path) -> None:
-    for name in ("b.txt", "a.txt", "._a.txt"):
-        (tmp_path / name).touch()
-    assert [file.name for file in list_files(tmp_path, "*.txt")] == ["a.txt", "b.txt"]
 
 
 def test_files_are_in_the_order_of_their_numbers(tmp_path: Path) -> None:

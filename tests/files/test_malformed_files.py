@@ -1,7 +1,5 @@
 """Malformed event files of every format: one clear line each."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Open event files of any format: real ones beside independent readers, made ones there and back, damaged ones."""
 
-from __future__ import annotations
-
 import re
 import sys
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Outputs of commands that fail."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Bags of ROS 1 and ROS 2."""
 
-from __future__ import annotations
-
 import re
 import sqlite3
 import sys

@@ -1,7 +1,5 @@
 """Trajectories in text files, and times in seconds."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

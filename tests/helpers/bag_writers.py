@@ -1,7 +1,5 @@
 """Write bags of ROS 1 and ROS 2 that hold events."""
 
-from __future__ import annotations
-
 import shutil
 import struct
 from pathlib import Path

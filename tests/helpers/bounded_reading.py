@@ -1,7 +1,5 @@
 """Reading with little memory, and without the rights of root."""
 
-from __future__ import annotations
-
 import codecs
 import os
 import resource

@@ -1,7 +1,5 @@
 """A headless Chromium, for the tests that look at pages."""
 
-from __future__ import annotations
-
 import json
 import shutil
 import subprocess

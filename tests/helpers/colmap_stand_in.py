@@ -1,7 +1,5 @@
 """Stand-ins for COLMAP, in tests of commands, and for its models. COLMAP itself is tested elsewhere."""
 
-from __future__ import annotations
-
 from types import SimpleNamespace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Running the real commands, for the tests that do."""
 
-from __future__ import annotations
-
 import os
 import re
 import subprocess

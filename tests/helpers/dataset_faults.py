@@ -3,8 +3,6 @@
 A change takes the folder of a dataset. Names of files are relative to it; those of bytes may be patterns.
 """
 
-from __future__ import annotations
-
 import json
 import re
 import shutil

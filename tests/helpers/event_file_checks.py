@@ -1,7 +1,5 @@
 """Read event files and check that malformed ones raise one clear line."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

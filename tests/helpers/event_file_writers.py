@@ -1,7 +1,5 @@
 """Write event files in the formats of cameras' vendors, from the descriptions of the formats."""
 
-from __future__ import annotations
-
 import struct
 from collections.abc import Callable
 from itertools import groupby

@@ -1,7 +1,5 @@
 """Write events in the layouts of other projects."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Plain faults of datasets of every format: a file, a number or a name that is missing or wrong."""
 
-from __future__ import annotations
-
 import shutil
 from functools import partial
 from pathlib import Path

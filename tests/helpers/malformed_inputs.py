@@ -1,7 +1,5 @@
 """Malformed datasets: what is too large, of the wrong kind, unreadable, absurd, or leads elsewhere."""
 
-from __future__ import annotations
-
 import os
 import struct
 import zipfile

@@ -1,7 +1,5 @@
 """A small recording of one's own, of random events, whose files tests write in the ways of users."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Datasets of other projects, written in the layout they are published in."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from collections.abc import Callable
@@ -13,7 +11,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from PIL import Image
-from scipy.spatial.transform import Rotation, Slerp
+from scipy.spatial.transform import Rotation
 
 from aenerf_ns.dataparsers.formats import FORMATS
 from aenerf_ns.recording.options import EventDataParserConfig
@@ -353,12 +351,3 @@ def recording_of(config: EventDataParserConfig) -> Recording:
 
 def assert_same_poses(actual: torch.Tensor, expected: NDArray[np.float64], tolerance: float = 1e-9) -> None:
     np.testing.assert_allclose(actual[:, :3].numpy(), expected[:, :3], rtol=0, atol=tolerance)
-
-
-def interpolated(truth: Truth, time: int) -> NDArray[np.float64]:
-    """The pose (4, 4) at a time in ns: linear in the position, the shortest turn."""
-    times, now = truth.times - truth.times[0], time - truth.times[0]
-    pose = np.eye(4)
-    pose[:3, :3] = Slerp(times, Rotation.from_matrix(truth.poses[:, :3, :3]))(now).as_matrix()
-    pose[:3, 3] = [np.interp(now, times, values) for values in truth.poses[:, :3, 3].T]
-    return pose

@@ -1,7 +1,5 @@
 """Small datasets in the native and the ECD format."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Small meshes for the tests of the simulator."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

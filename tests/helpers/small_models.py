@@ -1,7 +1,5 @@
 """Small samplers, models and batches."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any

@@ -1,7 +1,5 @@
 """Small trainings in the tests' own process."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from copy import deepcopy

@@ -1,6 +1,4 @@
-"""Small event streams, a file that holds one, and how many examples random tests draw."""
-
-from __future__ import annotations
+"""Small event streams, a file that holds one, the pairs of a table, and how many examples random tests draw."""
 
 import os
 from collections.abc import Iterator, Sequence
@@ -10,6 +8,7 @@ import numpy as np
 from hypothesis import strategies as st
 from numpy.typing import ArrayLike
 
+from aenerf_ns.events.pair_store import EventPairs
 from aenerf_ns.events.stream import EventStream
 from aenerf_ns.files.event_reader import EventFile
 
@@ -54,3 +53,25 @@ class EventsInMemory(EventFile):
 
     def require(self) -> None:
         pass
+
+
+def unpacked(pairs: EventPairs) -> list[tuple[int, ...]]:
+    """(x, y, previous time, time, positives, negatives, reach) of every pair, in the order of the rows."""
+    assert len(pairs.rows) % 16 == 0
+    found, positive, negative, heads = [], 0, 0, 0
+    for row, (time, number) in enumerate(pairs.rows.tolist()):
+        pixel, reach, low = number >> 40, number >> 32 & 255, number & 0xFFFFFFFF
+        if reach:
+            # In eighths of an event, with what the pixel is blind to after it: no whole number of events.
+            sums = (low - positive) & 0xFFFF, ((low >> 16) - negative) & 0xFFFF
+            counts = tuple(int(other == 0) if own % 8 else own // 8 for own, other in (sums, sums[::-1]))
+            positive, negative = low & 0xFFFF, low >> 16
+            place = (pixel % pairs.width, pixel // pairs.width)
+            found.append((*place, int(pairs.rows[row - 1, 0]), time, *counts, reach))
+        else:
+            positive = negative = 0
+            if (time, number) != (0, 0) or row == 0:
+                assert low == heads
+                heads += 1
+    assert len(found) == len(pairs)
+    return found

@@ -6,8 +6,6 @@ With ``SHARED_BATCHES`` in the environment, any number of processes sees the sam
 one batch, and samples are at the same places along the rays.
 """
 
-from __future__ import annotations
-
 import os
 from collections.abc import Callable
 from datetime import timedelta

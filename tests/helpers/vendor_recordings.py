@@ -1,7 +1,5 @@
 """Recordings of one's own with an event file of each vendor's format, or with poses from COLMAP, and bombs in them."""
 
-from __future__ import annotations
-
 import bz2
 import shutil
 import sqlite3

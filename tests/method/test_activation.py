@@ -1,7 +1,5 @@
 """The sharp softplus: numba's beside torch's in float64."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import torch

@@ -1,7 +1,5 @@
 """The protocols of color correction: what each recovers, from which views, and that it is stored."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Literal
 

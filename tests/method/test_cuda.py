@@ -1,7 +1,5 @@
 """Training on a GPU: where there is one, for real; anywhere, on a simulated one, with the cost of a step."""
 
-from __future__ import annotations
-
 import json
 from collections import defaultdict
 from copy import deepcopy

@@ -1,7 +1,5 @@
 """The hash grid: the plain implementation beside the framework's, the others beside the plain one, and the choice."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

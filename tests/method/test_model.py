@@ -1,7 +1,5 @@
 """The model: rendering, losses and color correction on small exact cases."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from types import SimpleNamespace

@@ -1,7 +1,5 @@
 """The pose correction and its offsets, against exact derivatives and in a known scene."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np
@@ -307,14 +305,3 @@ def test_checkpoints_without_a_finer_spline_load() -> None:
     correction.load_state_dict(earlier.state_dict())
     expected = earlier.twists(seconds, torch.empty(0))
     torch.testing.assert_close(correction.twists(seconds, torch.empty(0)), expected, rtol=0, atol=0)
-
-
-def test_the_spline_is_smooth_and_reproduces_a_straight_line() -> None:
-    correction = _correction(mode="spline")
-    spline = correction.twists
-    with torch.no_grad():
-        # A uniform B-spline whose control points lie on a line is that line.
-        spline.control_twists.copy_(torch.arange(len(spline.control_twists))[:, None] * torch.ones(6))
-    seconds = torch.linspace(0, 2, 401, dtype=torch.float64)
-    twist = spline(seconds, correction.trajectory.pose(seconds))
-    torch.testing.assert_close(twist[:, 0].double(), 1 + seconds / 0.1, rtol=0, atol=1e-4)

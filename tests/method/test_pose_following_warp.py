@@ -1,7 +1,5 @@
 """The field moves along with corrections of the poses."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

@@ -1,7 +1,5 @@
 """The distortion loss in linear time, beside the framework's."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from helpers.small_models import make_rays

@@ -1,7 +1,5 @@
 """The temporal derivative, in float64 against double backward."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

@@ -1,7 +1,5 @@
 """The registered methods: how they differ from each other, and that each of them trains."""
 
-from __future__ import annotations
-
 from copy import deepcopy
 from dataclasses import asdict
 from pathlib import Path

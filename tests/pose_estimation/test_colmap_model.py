@@ -1,7 +1,5 @@
 """Which frames of a COLMAP model have a pose, and how its world lies."""
 
-from __future__ import annotations
-
 import numpy as np
 import pycolmap
 import pytest

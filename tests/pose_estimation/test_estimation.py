@@ -1,7 +1,5 @@
 """Poses from frames and from events: what COLMAP makes of a short recording, and the arithmetic around it."""
 
-from __future__ import annotations
-
 import contextlib
 import dataclasses
 import json

@@ -1,7 +1,5 @@
 """Images of the events that poses are estimated from."""
 
-from __future__ import annotations
-
 from types import SimpleNamespace
 
 import cv2

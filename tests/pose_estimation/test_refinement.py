@@ -1,7 +1,5 @@
 """Poses that follow tracks: the arithmetic, on tracks whose errors are known."""
 
-from __future__ import annotations
-
 from typing import Literal
 
 import numpy as np

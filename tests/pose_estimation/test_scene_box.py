@@ -1,7 +1,5 @@
 """The box around what the camera goes around."""
 
-from __future__ import annotations
-
 from types import SimpleNamespace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Frames and times of videos: what a lossless file and a folder of images hold, and what is refused."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any

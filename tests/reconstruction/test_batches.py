@@ -1,7 +1,5 @@
 """Batches of events and their voxel grids."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from helpers.streams import make_stream

@@ -1,7 +1,5 @@
 """Images of simulated events against the intensity that triggered them."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 
 import cv2

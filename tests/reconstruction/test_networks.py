@@ -1,7 +1,5 @@
 """E2VID's and FireNet's networks: parameters by the names of the authors' files, and how they run."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 
@@ -90,10 +88,6 @@ def test_load_documented_weights(name: str, number: int, weights: int, tmp_path:
         assert torch.equal(network.state_dict()[key.removeprefix(f"{network.name_in_file}.")], values)
 
 
-class Foreign:
-    """A class that a file of plain weights does not hold."""
-
-
 @pytest.mark.parametrize("name", ["e2vid", "firenet"])
 def test_refuse_unusable_weights(name: str, tmp_path: Path) -> None:
     file = "E2VID_lightweight.pth.tar" if name == "e2vid" else "firenet_1000.pth.tar"
@@ -103,7 +97,7 @@ def test_refuse_unusable_weights(name: str, tmp_path: Path) -> None:
     faults: list[tuple[Path, str]] = [
         (tmp_path / "none.pth", "none.pth: there is no such file"),
         (tmp_path / ("n" * 300), "n: it cannot be read"),
-        (save(tmp_path / "code.pth", name, config=Foreign()), "code.pth: not a file of plain weights"),
+        (save(tmp_path / "code.pth", name, config=Path("x")), "code.pth: not a file of plain weights"),
         (save(tmp_path / "empty.pth", name, state_dict=None), "empty.pth: it holds no state_dict"),
         (save(tmp_path / "number.pth", name, state_dict={1: torch.zeros(1)}), "number.pth: it holds no state_dict"),
         (

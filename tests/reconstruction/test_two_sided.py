@@ -1,7 +1,5 @@
 """The filter that runs forwards and backwards."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import replace
 

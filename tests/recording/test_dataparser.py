@@ -1,7 +1,5 @@
 """Handing a recording to Nerfstudio: time window, world, cameras and images."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import h5py
@@ -12,7 +10,7 @@ import torch.nn.functional as F
 from helpers.dataset_faults import set_in
 from helpers.published_datasets import DURATION, EPOCH, config_of, seconds, write_images, write_own
 from helpers.small_datasets import END, START, make_trajectory, parse, write_native
-from helpers.unpacked_pairs import unpacked
+from helpers.streams import unpacked
 
 from aenerf_ns.camera.time_window import TimeWindow
 from aenerf_ns.camera.trajectory import Trajectory

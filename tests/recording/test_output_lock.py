@@ -1,7 +1,5 @@
 """One command at a time for an output."""
 
-from __future__ import annotations
-
 import errno
 import os
 from pathlib import Path

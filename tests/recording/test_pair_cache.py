@@ -1,7 +1,5 @@
 """The file of pairs beside a long recording: found again, made again, never trusted when it is broken."""
 
-from __future__ import annotations
-
 import fcntl
 import os
 import socket

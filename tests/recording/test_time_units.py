@@ -1,7 +1,5 @@
 """Units of the times of events and poses: taken as the help says, or named where the two do not fit."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Writing the native dataset format."""
 
-from __future__ import annotations
-
 import errno
 import os
 import shutil

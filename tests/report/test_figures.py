@@ -1,7 +1,5 @@
 """The figures of a report, before they are shown."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any
@@ -13,6 +11,7 @@ import torch
 from helpers.small_pipelines import make_pipeline
 from helpers.streams import make_stream
 
+from aenerf_ns.camera.alignment import pose_errors
 from aenerf_ns.camera.intrinsics import CameraIntrinsics
 from aenerf_ns.camera.noise import perturb
 from aenerf_ns.camera.rotation import motion_from_twist
@@ -30,11 +29,11 @@ from aenerf_ns.report.view_pictures import choose_views
 SECOND = 10**9
 
 
-def evo_statistics(reference: Any, path: Any) -> dict[str, dict[str, float]]:
-    """What ``evo_ape -as`` and ``evo_rpe -as`` print, under the names of a report."""
+def evo_statistics(reference: Any, path: Any, with_scale: bool = True) -> dict[str, dict[str, float]]:
+    """What ``evo_ape -as`` and ``evo_rpe -as`` print, or without scale -a alone, under the names of a report."""
     from evo.core import metrics
 
-    path.align(reference, correct_scale=True)
+    path.align(reference, correct_scale=with_scale)
     relation = metrics.PoseRelation
     found = {
         "ate": metrics.APE(relation.translation_part),
@@ -120,6 +119,14 @@ def test_errors_match_evo(random_poses: torch.Tensor, tmp_path: Path) -> None:
     for name, expected in evo_statistics(*paths).items():
         # The scene's transform is of float32.
         assert found.evo["estimated"][name] == pytest.approx(expected, rel=1e-4, abs=1e-5 * expected["max"]), name
+    # In another unit, so that the scale counts.
+    scaled = given.camera_to_worlds * torch.tensor([1.0, 1.0, 1.0, 2.5])
+    errors = pose_errors(scaled, true.camera_to_worlds)
+    for name, with_scale in (("sim3", True), ("se3", False)):
+        reference, path = sync.associate_trajectories(*map(read_tum_trajectory_file, files))
+        path.scale(2.5)
+        expected = evo_statistics(reference, path, with_scale)["ate"]["rmse"]
+        assert errors[f"ate_rmse_{name}"] == pytest.approx(expected, rel=1e-9), name
 
 
 def report_of(name: str, psnr: list[float]) -> RunReport:

@@ -1,13 +1,11 @@
 """The page of a report, made of figures that need no run."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from PIL import Image
 
 from aenerf_ns.checking.result import CheckResult
@@ -25,15 +23,12 @@ from aenerf_ns.report.view_pictures import ViewPictures
 HOSTILE = '<script>alert("&")</script>'
 
 
+# In place of warped events, of which a page only needs the picture.
+DRAWING = SimpleNamespace(picture=lambda: np.zeros((100, 2000, 3), np.uint8))
+
+
 def picture() -> Image.Image:
     return Image.new("RGB", (6, 4), "red")
-
-
-class Drawing:
-    """Stands in for warped events, of which a page only needs the picture."""
-
-    def picture(self) -> NDArray[np.uint8]:
-        return np.zeros((100, 2000, 3), np.uint8)
 
 
 def make_report(name: str, **changes: Any) -> RunReport:
@@ -72,7 +67,7 @@ def make_report(name: str, **changes: Any) -> RunReport:
         ),
         "scalars": {"Train Loss Dict/reconstruction_loss": ([0, 1], [1.0, 0.5])},
         "pose_gaps_ns": [[1, 2]],
-        "check": CheckResult(events, ["Events: 1000"], [HOSTILE], warped=Drawing()),
+        "check": CheckResult(events, ["Events: 1000"], [HOSTILE], warped=DRAWING),
         "estimation": PosesReport(HOSTILE, picture()),
         "num_pairs": "1000 pairs",
         "drift": PolarityDrift(np.zeros((4, 6)), np.zeros((4, 6)), 0.06),

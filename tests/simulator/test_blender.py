@@ -1,7 +1,5 @@
 """Scenes of Blender, up to the events. Blender writes the files that it then renders."""
 
-from __future__ import annotations
-
 import json
 import os
 import signal

@@ -1,7 +1,5 @@
 """The promises of the built-in scenes."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from helpers.small_meshes import ray_directions

@@ -1,7 +1,5 @@
 """The simulator against closed forms and against a slow reference that follows the sensor's definition."""
 
-from __future__ import annotations
-
 import math
 from typing import Any, get_args
 

@@ -1,7 +1,5 @@
 """The spacing of frames along a path."""
 
-from __future__ import annotations
-
 import itertools
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The light that meshes receive, against closed forms."""
 
-from __future__ import annotations
-
 import dataclasses
 from pathlib import Path
 

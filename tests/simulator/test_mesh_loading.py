@@ -1,7 +1,5 @@
 """Meshes from files, and errors in them."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Subdivision, coincident and degenerate faces, and concave polygons."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Meshes and scene.json files as scenes, up to the events."""
 
-from __future__ import annotations
-
 import json
 import sys
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Camera paths, their speed, and the space that they need."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from helpers.small_meshes import WALK, plate

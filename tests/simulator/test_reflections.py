@@ -1,7 +1,5 @@
 """Reflections of glossy surfaces, against closed forms and against single facets."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 

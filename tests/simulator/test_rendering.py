@@ -1,7 +1,5 @@
 """Pictures of meshes against closed forms."""
 
-from __future__ import annotations
-
 import dataclasses
 import sys
 

@@ -1,7 +1,5 @@
 """The shapes of the built-in scenes against closed forms."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from collections.abc import Callable

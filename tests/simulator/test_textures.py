@@ -1,7 +1,5 @@
 """Procedural textures."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Events of videos, against closed forms and against the exact simulation of the scene between the frames."""
 
-from __future__ import annotations
-
 import math
 import weakref
 from collections.abc import Callable, Iterator

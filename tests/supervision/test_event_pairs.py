@@ -1,7 +1,5 @@
 """Pairs of events: the rays and counts of a batch on small exact cases."""
 
-from __future__ import annotations
-
 import math
 from collections import Counter
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Supervision by images: which images, which pixels, and what their renderings are compared with."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from pathlib import Path
@@ -12,6 +10,7 @@ import pytest
 import torch
 from helpers.small_datasets import AS_RECORDED, END, START, parse
 from helpers.small_models import EPOCH, KNOTS, make_scene, make_supervision, pixels_of
+from helpers.small_pipelines import make_pipeline_config
 from PIL import Image
 
 from aenerf_ns.camera.trajectory import Trajectory
@@ -104,3 +103,11 @@ def test_a_dataset_hands_on_the_timed_training_images_of_the_event_camera(native
     meta["fl_x"] += 1
     (native / "transforms.json").write_text(json.dumps(meta))
     assert parse(config).metadata[SCENE_KEY].frames == ()
+
+
+def test_a_sampler_for_another_supervision_is_refused(tmp_path: Path) -> None:
+    config = make_pipeline_config(tmp_path / "data")
+    config.datamanager = replace(config.datamanager, sampler=SamplerConfig(_target=FrameSampler))
+    message = "its sampler draws a FrameBatch, and its supervision compares a PairBatch; give it"
+    with pytest.raises(SystemExit, match=message):
+        config.setup(device="cpu", test_mode="val")

@@ -1,7 +1,5 @@
 """Loss values, image metrics and image encodings on cases worked out by hand."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 

@@ -1,7 +1,5 @@
 """Learned contrast thresholds and refractory period."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from types import SimpleNamespace
 

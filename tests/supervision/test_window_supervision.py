@@ -1,7 +1,5 @@
 """Windows of time: what is drawn, and what EventNeRF and Ev-NeRF make of it."""
 
-from __future__ import annotations
-
 from collections import Counter
 from typing import Any
 

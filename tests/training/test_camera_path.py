@@ -1,7 +1,5 @@
 """The camera path of ``ns-render camera-path``, checked before the run is opened."""
 
-from __future__ import annotations
-
 import json
 import sys
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Checkpoints: whole or not at all, and a broken one blocks nothing."""
 
-from __future__ import annotations
-
 import errno
 import os
 import pickle

@@ -1,7 +1,5 @@
 """What training prints."""
 
-from __future__ import annotations
-
 import itertools
 import re
 from copy import deepcopy

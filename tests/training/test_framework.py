@@ -1,7 +1,5 @@
 """What is used of Nerfstudio although it is private: that it exists, and that nothing else is."""
 
-from __future__ import annotations
-
 import ast
 import importlib
 import inspect

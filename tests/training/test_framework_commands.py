@@ -1,7 +1,5 @@
 """What a user does with a trained run, through the real commands: evaluate, resume, render, view, export."""
 
-from __future__ import annotations
-
 import csv
 import errno
 import json

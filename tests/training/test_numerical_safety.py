@@ -1,7 +1,5 @@
 """No NaN and no infinity reaches a weight: extreme scenes and batches, mixed precision, and the guard behind them."""
 
-from __future__ import annotations
-
 import json
 import math
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """The diagnosis of pose correction: what it sees in poses that are right, wrong or not moving, and what it says."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Alignment of trajectories and their errors, and reference views in the frame of the corrected poses."""
 
-from __future__ import annotations
-
 import copy
 import json
 import math
@@ -23,7 +21,7 @@ from aenerf_ns.camera.alignment import Similarity, align, pose_errors, rotation_
 from aenerf_ns.camera.intrinsics import CameraIntrinsics
 from aenerf_ns.camera.metadata_keys import REFERENCE_SECONDS
 from aenerf_ns.camera.noise import perturb
-from aenerf_ns.camera.rotation import motion_from_twist, quaternion_from_rotation, rotation_from_vector
+from aenerf_ns.camera.rotation import motion_from_twist, rotation_from_vector
 from aenerf_ns.camera.trajectory import Trajectory, homogeneous
 from aenerf_ns.errors import DataError
 from aenerf_ns.evaluation.pose_refinement import refine_camera
@@ -71,30 +69,6 @@ def test_errors_are_those_of_known_displacements(random_poses: torch.Tensor) -> 
     assert errors["ate_rmse_se3"] == pytest.approx(0.01, rel=1e-3)
     length = float(reference[..., 3].diff(dim=0).norm(dim=-1).sum())
     assert errors["translation_error_percent"] == pytest.approx(100 * errors["translation_error"] / length)
-
-
-def test_the_absolute_trajectory_error_is_evo_s(random_poses: torch.Tensor) -> None:
-    metrics = pytest.importorskip("evo.core.metrics", reason="evo is not installed")
-    from evo.core.trajectory import PosePath3D
-
-    reference = make_truth(random_poses)
-    noisy = perturb(reference, rotation_degrees=3.0, translation=0.2, correlation_time=0.3, seed=1)
-    poses = some_similarity(2.5)(noisy.camera_to_worlds)
-    errors = pose_errors(poses, reference.camera_to_worlds)
-    for name, with_scale in (("sim3", True), ("se3", False)):
-        paths = [
-            PosePath3D(
-                positions_xyz=p[..., 3].numpy(),
-                orientations_quat_wxyz=quaternion_from_rotation(p[..., :3])[:, [3, 0, 1, 2]].numpy(),
-            )
-            for p in (reference.camera_to_worlds, poses)
-        ]
-        paths[1].align(paths[0], correct_scale=with_scale)
-        ape = metrics.APE(metrics.PoseRelation.translation_part)
-        ape.process_data(tuple(paths))
-        expected = ape.get_statistic(metrics.StatisticsType.rmse)
-        assert expected > 0.05
-        assert errors[f"ate_rmse_{name}"] == pytest.approx(expected, rel=1e-9)
 
 
 def test_orientations_settle_the_alignment_of_a_straight_line() -> None:

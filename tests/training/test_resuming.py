@@ -1,7 +1,5 @@
 """Trainings that resume from a checkpoint."""
 
-from __future__ import annotations
-
 import inspect
 import json
 import os

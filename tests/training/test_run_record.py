@@ -1,7 +1,5 @@
 """What a run keeps of its own training, beside its checkpoints."""
 
-from __future__ import annotations
-
 import json
 import signal
 import subprocess

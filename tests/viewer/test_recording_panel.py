@@ -1,7 +1,5 @@
 """What the viewer is sent: through Nerfstudio's own viewer, without a browser's drawing."""
 
-from __future__ import annotations
-
 import io
 import re
 import time

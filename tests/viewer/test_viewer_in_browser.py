@@ -1,7 +1,5 @@
 """The viewer's panel as a user sees it: through Chromium, which draws it."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest
