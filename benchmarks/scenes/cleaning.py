@@ -6,8 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
+from trimesh.graph import connected_component_labels
 
 from aenerf_ns.simulator.rendering.embree import RayCaster
 from benchmarks.scenes.meshes import Array, Model, areas, longest_sides, unit_normals
@@ -53,8 +52,7 @@ def _pieces(triangles: Array, normals: Array) -> NDArray[np.int64]:
     same = (edges[order][1:] == edges[order][:-1]).all(axis=1)
     a, b = order[:-1][same] // 3, order[1:][same] // 3
     flat = (normals[a] * normals[b]).sum(axis=1) > 0.999
-    graph = coo_matrix((np.ones(flat.sum()), (a[flat], b[flat])), shape=(len(triangles),) * 2)
-    return connected_components(graph, directed=False)[1]
+    return connected_component_labels(np.stack([a[flat], b[flat]], axis=1), len(triangles))
 
 
 def _overlapped(triangles: Array, asked: NDArray[np.bool_], tolerance: float) -> NDArray[np.bool_]:

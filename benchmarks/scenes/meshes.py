@@ -10,9 +10,11 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
+import torch
 from numpy.typing import ArrayLike, NDArray
+from trimesh.triangles import area as areas
 
-from aenerf_ns.camera.image_encoding import decode
+from aenerf_ns.camera.image_encoding import decode, encode
 from aenerf_ns.simulator.arrays import Array, Texture
 from aenerf_ns.simulator.textures import ALBEDO_RANGE
 
@@ -128,9 +130,8 @@ def colored_copy(material: Material, color: ArrayLike) -> Material:
 
 def srgb_picture(value: ArrayLike) -> NDArray[np.uint8]:
     """Encode linear values in [0, 1], any shape, as sRGB (IEC 61966-2-1)."""
-    value = np.clip(np.asarray(value, np.float64), 0, 1)
-    encoded = np.where(value <= 0.0031308, 12.92 * value, 1.055 * value ** (1 / 2.4) - 0.055)
-    return np.rint(255 * encoded).astype(np.uint8)
+    encoded = encode(torch.from_numpy(np.asarray(value, np.float64)), "srgb")
+    return np.rint(255 * encoded.numpy()).astype(np.uint8)
 
 
 def cross_2d(a: Array, b: Array) -> Array:
@@ -142,11 +143,6 @@ def unit_normals(triangles: Array) -> Array:
     """Return the unit normals (F, 3) of triangles (F, 3, 3)."""
     normals = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
     return normals / np.linalg.norm(normals, axis=1, keepdims=True)
-
-
-def areas(triangles: Array) -> Array:
-    """Return the areas (F,) of triangles (F, 3, 3)."""
-    return 0.5 * np.linalg.norm(np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]), axis=1)
 
 
 def longest_sides(triangles: Array) -> Array:

@@ -1,18 +1,19 @@
 """Reading OBJ files, with what the furniture needs of the format.
 
-trimesh would read them faster, but fills concave polygons wrongly, orders triangles and their corners otherwise (the
-scenes would not stay the same), and passes over malformed materials in silence. mapbox-earcut would triangulate them
-faster, but into other triangles.
+trimesh reads their materials. It would read the rest faster, but fills concave polygons wrongly, and orders triangles
+and their corners otherwise: the scenes would not stay the same. mapbox-earcut would make other triangles of polygons.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from trimesh.exchange.obj import parse_mtl
+from trimesh.resolvers import FilePathResolver
 
 from aenerf_ns.errors import DataError
 from benchmarks.scenes.meshes import Array, Material, Model, Part, cross_2d, not_degenerate, unit_normals
@@ -21,13 +22,6 @@ from benchmarks.scenes.meshes import Array, Material, Model, Part, cross_2d, not
 _MIN_OPACITY = 0.8
 _TILE = 0.35
 """Side of a texture tile in meters, where the file gives no texture coordinates."""
-
-
-@dataclass(frozen=True)
-class _ObjMaterial:
-    color: tuple[float, float, float] = (0.6, 0.6, 0.6)
-    opacity: float = 1.0
-    picture: Path | None = None
 
 
 def read_obj(
@@ -49,7 +43,7 @@ def read_obj(
     """
     vertices: list[list[float]] = []
     texture: list[list[float]] = []
-    materials: dict[str, _ObjMaterial] = {}
+    materials: dict[str, dict[str, Any]] = {}
     polygons: dict[str, list[NDArray[np.int64]]] = {}
     current = ""
     try:
@@ -68,7 +62,8 @@ def read_obj(
             elif key == "usemtl":
                 current = value.strip()
             elif key == "mtllib":
-                materials.update(_read_mtl(path.parent / value.strip()))
+                library = path.parent / value.strip()
+                materials |= parse_mtl(library.read_text(errors="replace"), FilePathResolver(str(library)))
     except (OSError, ValueError, IndexError) as error:
         raise DataError(path, f"not a readable OBJ file ({error})", "remove the asset cache and build again") from error
     if not polygons:
@@ -81,15 +76,16 @@ def read_obj(
     coordinates = np.array([*texture, [0.0, 0.0]])
     parts = []
     for name, faces in polygons.items():
-        entry = materials.get(name, _ObjMaterial())
-        if entry.opacity < _MIN_OPACITY:
+        entry = materials.get(name, {})
+        if float(entry.get("d", [1])[-1]) < _MIN_OPACITY:
             continue
+        picture = path.parent / entry["image"].info["file_path"] if "image" in entry else None
         corners = np.concatenate([face[:, triangulate(points[face[0]])] for face in faces], axis=1)
         where, at = corners[:, not_degenerate(points[corners[0]])]
-        bare = (at < 0)[..., None] | (entry.picture is None)
+        bare = (at < 0)[..., None] | (picture is None)
         uv = np.where(bare, _plane_coordinates(points[where]) / _TILE, coordinates[at])
         if len(where):
-            parts.append(Part(points[where], uv, surface(name, entry.color, entry.picture)))
+            parts.append(Part(points[where], uv, surface(name, tuple(entry.get("kd", (0.6, 0.6, 0.6))), picture)))
     return Model(tuple(parts))
 
 
@@ -148,26 +144,6 @@ def _index(text: str, count: int) -> int:
     """Return the index from 0 of an OBJ reference, which counts from 1, or back from the end if negative."""
     number = int(text)
     return number - 1 if number > 0 else count + number
-
-
-def _read_mtl(path: Path) -> dict[str, _ObjMaterial]:
-    """Read the colors, opacities and pictures of a material library, by material name."""
-    materials: dict[str, _ObjMaterial] = {}
-    name = ""
-    for line in path.read_text(errors="replace").splitlines():
-        key, _, value = line.strip().partition(" ")
-        value = value.strip()
-        if key == "newmtl":
-            name = value
-            materials[name] = _ObjMaterial()
-        elif key == "Kd":
-            red, green, blue = (float(number) for number in value.split()[:3])
-            materials[name] = replace(materials[name], color=(red, green, blue))
-        elif key == "d":
-            materials[name] = replace(materials[name], opacity=float(value.split()[-1]))
-        elif key == "map_Kd" and (path.parent / value).is_file():
-            materials[name] = replace(materials[name], picture=path.parent / value)
-    return materials
 
 
 def _plane_coordinates(triangles: Array) -> Array:
