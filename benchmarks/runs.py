@@ -9,7 +9,6 @@ import shlex
 import shutil
 import subprocess
 import sys
-import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -32,15 +31,14 @@ def die_with_parent(command: Sequence[str]) -> list[str]:
     return [setpriv, "--pdeathsig", "KILL", "--", *command] if setpriv else list(command)
 
 
-def run_command(command: Sequence[str], log: Path, folder: Path = Path(), **variables: str) -> float:
-    """Run a command in a folder, with more environment variables, and return its seconds of wall-clock time.
+def run_command(command: Sequence[str], log: Path, folder: Path = Path(), **variables: str) -> None:
+    """Run a command in a folder, with more environment variables.
 
     Its output is added to the file ``log``.
 
     Raises:
         DataError: the command failed.
     """
-    begin = time.perf_counter()
     with log.open("a", encoding="utf8") as output:
         output.write(f"$ {shlex.join(command)}\n")
         output.flush()
@@ -55,7 +53,6 @@ def run_command(command: Sequence[str], log: Path, folder: Path = Path(), **vari
                 raise
     if status:
         raise DataError(log, f"a command ended with status {status}", "see the end of this file")
-    return time.perf_counter() - begin
 
 
 @contextmanager

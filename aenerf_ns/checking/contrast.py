@@ -38,6 +38,9 @@ from aenerf_ns.events.stream import EventStream
 _SHUFFLED_COLUMNS = (("p",), ("x", "y"), ("x", "y", "p"))
 _PICTURE_HEIGHT = 480
 
+MIN_EVENTS = 2_000
+"""Fewer events give no contrast."""
+
 # Slices of a recording.
 _NUM_SLICES = 8
 # Events per pixel in a slice. They are tried in turn, until the image without warping is smeared.
@@ -94,14 +97,13 @@ def choose_runs(num_events: int, camera: CameraIntrinsics) -> tuple[NDArray[np.i
     return np.linspace(0, num_events - length, _NUM_SLICES).astype(np.int64), length
 
 
-def longest_stretches(runs: list[EventStream], window: TimeWindow, min_events: int) -> list[EventStream]:
+def longest_stretches(runs: list[EventStream], window: TimeWindow) -> list[EventStream]:
     """Return the stretches of runs between the gaps of a time window, as many as there are slices at most.
 
-    The events of a slice are warped as one motion, which a gap between the poses would be in. Stretches of fewer than
-    ``min_events`` are left out.
+    The events of a slice are warped as one motion, which a gap between the poses would be in.
     """
     stretches = [run.between(*piece) for run in runs for piece in window.pieces()]
-    longest = sorted((part for part in stretches if len(part) >= min_events), key=len)[-_NUM_SLICES:]
+    longest = sorted((part for part in stretches if len(part) >= MIN_EVENTS), key=len)[-_NUM_SLICES:]
     return sorted(longest, key=lambda part: part.t[0])
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from aenerf_ns.camera.time_window import TimeWindow
-from aenerf_ns.checking.contrast import WarpedEvents, choose_runs, longest_stretches
+from aenerf_ns.checking.contrast import MIN_EVENTS, WarpedEvents, choose_runs, longest_stretches
 from aenerf_ns.checking.contrast_checks import check_contrast, check_depth
 from aenerf_ns.checking.event_checks import check_events, check_lens, check_polarity, check_thresholds
 from aenerf_ns.checking.frames import FrameChanges
@@ -22,8 +22,6 @@ from aenerf_ns.progress import progress_bar
 from aenerf_ns.recording.recording import Capture, Recording
 
 _RATE_PARTS = 60
-# Fewer events give no contrast.
-_MIN_EVENTS = 2_000
 
 
 def check(
@@ -50,11 +48,11 @@ def check(
     check_steps(result, recording.trajectory, window)
     is_simple = len(result.problems) > num_problems
     # The events are read once more only where there can be enough.
-    runs = _read_runs(recording, window, num_covered) if num_covered >= _MIN_EVENTS else []
-    runs = longest_stretches(runs, window, _MIN_EVENTS)
+    runs = _read_runs(recording, window, num_covered) if num_covered >= MIN_EVENTS else []
+    runs = longest_stretches(runs, window)
     if not runs:
         result.figures.append(
-            f"Contrast of warped events: not computed, because no {_MIN_EVENTS} events have poses without a gap."
+            f"Contrast of warped events: not computed, because no {MIN_EVENTS} events have poses without a gap."
         )
         return result
     with progress_bar() as progress:

@@ -22,8 +22,6 @@ _MAX_CLOCK_SHARE = 0.9
 _MAX_LOSS_SHARE = 0.15
 # Stretches hold equally many of the drawn pairs.
 _NUM_STRETCHES, _PAIRS_PER_STRETCH = 10, 512
-# Fewer events give no contrast.
-_MIN_EVENTS = 2_000
 # Poses that events are warped by.
 _NUM_POSES = 10_000
 
@@ -92,7 +90,6 @@ def _measure_stretches(run: TrainedRun) -> list[dict[str, float]]:
     if drawn is None:
         return []
     rays, batch = drawn
-    assert rays.times is not None
     middle = rays.times[:, 0].unflatten(0, (2, len(batch))).mean(0)
     model.eval()
     stretches = []
@@ -118,7 +115,7 @@ def _measure_stretches(run: TrainedRun) -> list[dict[str, float]]:
 def _compare_contrast(run: TrainedRun) -> dict[str, Any]:
     """Compare the contrast of events warped by the estimated and by the corrected poses."""
     # Imported lazily: every ns-* command imports this module, and numba is slow to import.
-    from aenerf_ns.checking.contrast import WarpedEvents
+    from aenerf_ns.checking.contrast import MIN_EVENTS, WarpedEvents
     from aenerf_ns.checking.hypotheses import Hypothesis
 
     correction = run.model.camera_optimizer
@@ -128,7 +125,7 @@ def _compare_contrast(run: TrainedRun) -> dict[str, Any]:
     except DataError:
         # A method that trains on images has not read the events. They must not end it before its last checkpoint.
         return absent
-    if len(events) < _MIN_EVENTS:
+    if len(events) < MIN_EVENTS:
         return absent
     base = correction.trajectory
     times = base.start + (base.end - base.start) * torch.arange(_NUM_POSES + 1) // _NUM_POSES

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
 from functools import partial
-from typing import Any, Literal
+from typing import Any
 
 import torch
 import torch.nn.functional as F
@@ -32,26 +31,6 @@ ToFieldSpace = Callable[[Tensor], Tensor]
 
 # The hidden layer whose output the encoding is joined to (NeRF, https://arxiv.org/abs/2003.08934, fig. 7).
 _SKIP_LAYER = 5
-
-
-@dataclass(frozen=True)
-class DensityShape:
-    """The network from an encoded position to density and feature.
-
-    Attributes:
-        num_hidden_layers: number of hidden layers. Where there are more than five, the encoding is joined to the output
-            of the fifth, as in NeRF.
-        hidden_dim: width of the hidden layers.
-        feature_dim: length of the feature that is handed on with the density, 0 for none.
-        activation: from the network's output to the density; "exp" is cut off at large exponents.
-        average_init_density: density where the network's output is 0, as it nearly is before training.
-    """
-
-    num_hidden_layers: int
-    hidden_dim: int
-    feature_dim: int
-    activation: Literal["exp", "softplus"]
-    average_init_density: float
 
 
 class IntegratedEncoding(NeRFEncoding):
@@ -93,9 +72,14 @@ class DensityField(Field):
     Args:
         aabb: (2, 3) scene box, which bounds the scene where there is no spatial distortion.
         spatial_distortion: contraction of space to a ball or cube of radius 2, or None for a bounded scene.
-        encoding: of positions in the contracted space or box, which is scaled to [0, 1] along each axis.
-        shape: of the network.
+        encoding: of positions in the contracted space or box, which is scaled to [0, 1] along each axis. With a hash
+            encoding the density is an exponential, which is cut off at large exponents, else a softplus.
         to_field_space: of a :class:`.pose_following_warp.PoseFollowingWarp`; None for a field fixed in the scene.
+        num_hidden_layers: number of hidden layers. Where there are more than five, the encoding is joined to the output
+            of the fifth, as in NeRF.
+        hidden_dim: width of the hidden layers.
+        average_init_density: density where the network's output is 0, as it nearly is before training.
+        feature_dim: length of the feature that is handed on with the density, 0 for none.
     """
 
     def __init__(
@@ -103,22 +87,24 @@ class DensityField(Field):
         aabb: Tensor,
         spatial_distortion: SpatialDistortion | None,
         encoding: Encoding,
-        shape: DensityShape,
         to_field_space: ToFieldSpace | None,
+        num_hidden_layers: int,
+        hidden_dim: int,
+        average_init_density: float,
+        feature_dim: int = 0,
     ) -> None:
         super().__init__()
         self.aabb: Tensor = nn.Buffer(aabb)
         self.to_field_space = to_field_space
         self.spatial_distortion = spatial_distortion
-        self.density_activation = shape.activation
-        self.average_init_density = shape.average_init_density
+        self.average_init_density = average_init_density
         self.encoding = encoding
         self.density_network = MLP(
             in_dim=encoding.get_out_dim(),
-            num_layers=shape.num_hidden_layers + 1,
-            layer_width=shape.hidden_dim,
-            out_dim=1 + shape.feature_dim,
-            skip_connections=(_SKIP_LAYER,) if shape.num_hidden_layers > _SKIP_LAYER else None,
+            num_layers=num_hidden_layers + 1,
+            layer_width=hidden_dim,
+            out_dim=1 + feature_dim,
+            skip_connections=(_SKIP_LAYER,) if num_hidden_layers > _SKIP_LAYER else None,
             activation=SharpSoftplus(),
         )
 
@@ -132,7 +118,7 @@ class DensityField(Field):
         raw = self.density_network(encoded).unflatten(0, positions.shape[:-1])
         raw_density, feature = raw.split([1, raw.shape[-1] - 1], dim=-1)
         raw_density = raw_density.to(positions.dtype)
-        if self.density_activation == "exp":
+        if isinstance(self.encoding, HashEncoding):
             density = _exponential_density(raw_density, self.average_init_density)
         else:
             density = F.softplus(raw_density + math.log(math.expm1(self.average_init_density)))
@@ -145,41 +131,30 @@ class EventRadianceField(DensityField):
     The encoding of the view direction is sinusoidal, because the framework's spherical harmonics run without gradients.
 
     Args:
-        aabb, spatial_distortion, encoding, shape, to_field_space: see :class:`DensityField`.
+        feature_dim: length of the feature that is handed on with the density.
         num_channels: radiance channels of the sensor, 1 or 3.
-        num_hidden_layers: of the network from feature and view direction to radiance.
-        hidden_dim: width of these layers.
+        num_radiance_layers: hidden layers of the network from feature and view direction to radiance.
+        radiance_dim: width of these layers.
+        of_density: see :class:`DensityField`.
     """
 
     def __init__(
-        self,
-        aabb: Tensor,
-        spatial_distortion: SpatialDistortion | None,
-        encoding: Encoding,
-        shape: DensityShape,
-        to_field_space: ToFieldSpace | None,
-        *,
-        num_channels: int,
-        num_hidden_layers: int,
-        hidden_dim: int,
+        self, *, feature_dim: int, num_channels: int, num_radiance_layers: int, radiance_dim: int, **of_density: Any
     ) -> None:
-        super().__init__(aabb, spatial_distortion, encoding, shape, to_field_space)
+        super().__init__(feature_dim=feature_dim, **of_density)
         self.direction_encoding = NeRFEncoding(
             in_dim=3, num_frequencies=4, min_freq_exp=0.0, max_freq_exp=3.0, include_input=True
         )
         self.radiance_network = MLP(
-            in_dim=self.direction_encoding.get_out_dim() + shape.feature_dim,
-            num_layers=num_hidden_layers + 1,
-            layer_width=hidden_dim,
+            in_dim=self.direction_encoding.get_out_dim() + feature_dim,
+            num_layers=num_radiance_layers + 1,
+            layer_width=radiance_dim,
             out_dim=num_channels,
             activation=SharpSoftplus(),
         )
 
-    def get_outputs(
-        self, ray_samples: RaySamples, density_embedding: Tensor | None = None
-    ) -> dict[FieldHeadNames, Tensor]:
+    def get_outputs(self, ray_samples: RaySamples, density_embedding: Tensor) -> dict[FieldHeadNames, Tensor]:
         """Return radiance (rays, samples, num_channels), positive and unbounded, by the framework's name for color."""
-        assert density_embedding is not None
         # All samples of a ray have its direction, so the first layer's part for it is computed once a ray.
         directions = self.direction_encoding(ray_samples.frustums.directions[..., :1, :])
         first, *others = self.radiance_network.layers

@@ -193,9 +193,7 @@ class AENeRFModel(Model):
         self, training_callback_attributes: TrainingCallbackAttributes
     ) -> list[TrainingCallback]:
         """Return the callbacks that schedule the proposal sampler, as the framework's own methods do, and the warp."""
-        trainer = training_callback_attributes.trainer
-        assert trainer is not None
-        last_accumulated = _ACCUMULATION_SHARE * trainer.config.schedule_length
+        last_accumulated = _ACCUMULATION_SHARE * training_callback_attributes.trainer.config.schedule_length
 
         def before_step(step: int) -> None:
             # https://arxiv.org/pdf/2111.12077.pdf, eq. 18
@@ -252,7 +250,6 @@ class AENeRFModel(Model):
         else:
             log_radiance, weights = self._composite(samples)
         if is_trained_on and self.warp is not None and self.warp.accumulating:
-            assert ray_bundle.times is not None
             self.warp.accumulate(samples.frustums.get_positions(), weights[..., 0], ray_bundle.times[:, 0])
         if self.training:
             outputs["log_radiance"] = log_radiance

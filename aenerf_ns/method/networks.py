@@ -10,7 +10,7 @@ from nerfstudio.field_components.spatial_distortions import SpatialDistortion
 from nerfstudio.fields.base_field import Field
 from torch import Tensor, nn
 
-from aenerf_ns.method.field import DensityField, DensityShape, EventRadianceField, IntegratedEncoding, ProposalNetwork
+from aenerf_ns.method.field import DensityField, EventRadianceField, IntegratedEncoding, ProposalNetwork
 from aenerf_ns.method.hash_grid import HashEncoding, Implementation
 from aenerf_ns.method.pose_following_warp import PoseFollowingWarp
 
@@ -93,7 +93,6 @@ def make_networks(
     # The proposal networks only follow the field: gradients reach the motion of space by the field alone.
     field_warp, proposal_warp = (None, None) if warp is None else (warp.forward, partial(warp.forward, detached=True))
     encoding: HashEncoding | IntegratedEncoding
-    activation: Literal["exp", "softplus"]
     if backbone == "hash":
         encoding = HashEncoding(
             num_levels=field.num_levels,
@@ -102,22 +101,23 @@ def make_networks(
             log2_hashmap_size=field.log2_hashmap_size,
             implementation=field.grid_implementation,
         )
-        activation, num_radiance_layers, radiance_dim = "exp", 2, field.hidden_dim
+        num_radiance_layers, radiance_dim = 2, field.hidden_dim
     else:
         encoding = IntegratedEncoding(field.num_frequencies)
         # As in NeRF and Mip-NeRF 360, whatever the width of the rest.
-        activation, num_radiance_layers, radiance_dim = "softplus", 1, 128
+        num_radiance_layers, radiance_dim = 1, 128
     radiance_field = EventRadianceField(
-        aabb,
-        spatial_distortion,
-        encoding,
-        DensityShape(
-            field.num_hidden_layers, field.hidden_dim, field.geometry_feature_dim, activation, average_init_density
-        ),
-        field_warp,
+        aabb=aabb,
+        spatial_distortion=spatial_distortion,
+        encoding=encoding,
+        to_field_space=field_warp,
+        num_hidden_layers=field.num_hidden_layers,
+        hidden_dim=field.hidden_dim,
+        average_init_density=average_init_density,
+        feature_dim=field.geometry_feature_dim,
         num_channels=num_channels,
-        num_hidden_layers=num_radiance_layers,
-        hidden_dim=radiance_dim,
+        num_radiance_layers=num_radiance_layers,
+        radiance_dim=radiance_dim,
     )
     if backbone == "hash":
         return radiance_field, [
@@ -139,6 +139,8 @@ def make_networks(
         for layer in radiance_field.density_network.layers:
             nn.init.xavier_uniform_(layer.weight)
             nn.init.zeros_(layer.bias)
-    shape = DensityShape(proposal.num_hidden_layers, proposal.hidden_dim, 0, "softplus", average_init_density)
     # One network, which every round of proposals evaluates again.
-    return radiance_field, [DensityField(aabb, spatial_distortion, encoding, shape, proposal_warp)]
+    size = proposal.num_hidden_layers, proposal.hidden_dim
+    return radiance_field, [
+        DensityField(aabb, spatial_distortion, encoding, proposal_warp, *size, average_init_density)
+    ]

@@ -230,7 +230,6 @@ class PoseCorrection(CameraOptimizer):
 
     def apply_to_raybundle(self, raybundle: RayBundle) -> None:
         """Move the rays of a batch, which have times, from the camera's frame to the corrected poses."""
-        assert raybundle.times is not None
         origins, directions = world_rays(self.pose(raybundle.times[:, 0]), raybundle.metadata[CAMERA_DIRECTIONS])
         raybundle.origins, raybundle.directions = origins.to(raybundle.origins), directions.to(raybundle.directions)
 
@@ -311,7 +310,6 @@ class PoseCorrection(CameraOptimizer):
 
     def ray_rates(self, raybundle: RayBundle) -> tuple[Tensor, Tensor]:
         """Return the derivatives of the corrected rays' origins and directions (N, 3) by time, per second."""
-        assert raybundle.times is not None
         _, rate = self.pose_and_rate(raybundle.times[:, 0])
         # Rays are linear in the pose.
         origin_rates, direction_rates = world_rays(rate, raybundle.metadata[CAMERA_DIRECTIONS])

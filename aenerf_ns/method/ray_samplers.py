@@ -22,12 +22,10 @@ class ProposalSampler(ProposalNetworkSampler):
 
     def generate_ray_samples(
         self,
-        ray_bundle: RayBundle | None = None,
-        density_fns: Sequence[Callable[[RaySamples], tuple[Tensor, Tensor | None]]] | None = None,
+        ray_bundle: RayBundle,
+        density_fns: Sequence[Callable[[RaySamples], tuple[Tensor, Tensor | None]]],
     ) -> tuple[RaySamples, list[Tensor], list[RaySamples]]:
         """Return samples of the field, and weights and samples of each round of proposals."""
-        assert ray_bundle is not None
-        assert density_fns is not None
         weights_list: list[Tensor] = []
         samples_list: list[RaySamples] = []
         # As in the framework: the proposal networks are trained at every step at first, and then at some.

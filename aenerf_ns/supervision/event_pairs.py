@@ -171,7 +171,6 @@ class PairSupervision(ChangeSupervision):
             learned["positive_contrast_threshold"] = ratio * self.sensor.negative_contrast_threshold
         period = self.refractory_period
         if period is not None:
-            assert rays.times is not None
             learned["interval_change"] = change = self.sensor.refractory_period * 1e-9 - period
             start, end, *within = rays.times.chunk(3 if self.training and self.needs_rates else 2)
             # t_sam keeps its relative position in the interval.

@@ -110,13 +110,11 @@ class EventDataManager(VanillaDataManager[EventDataset]):
 
     def next_train(self, step: int) -> tuple[RayBundle, Batch]:
         """Draw a batch to train on; see :meth:`Sampler.sample`."""
-        self.train_count += 1
         # An exporter asks a trained run for batches too: its events are read only then.
         return self._sample(self.get_train_rays_per_batch(), training=self.test_mode == "val")
 
     def next_eval(self, step: int) -> tuple[RayBundle, Batch]:
         """Draw a batch to log the loss on."""
-        self.eval_count += 1
         return self._sample(self.config.eval_num_rays_per_batch, training=False)
 
     def _sample(self, num_rays: int, training: bool) -> tuple[RayBundle, Batch]:

@@ -133,7 +133,6 @@ class AENeRFPipeline(VanillaPipeline):
     ) -> list[TrainingCallback]:
         """Return all callbacks, with the color correction's and the diagnosis', and let optimizers check gradients."""
         trainer = training_callback_attributes.trainer
-        assert trainer is not None
         steps = steps_of(trainer)
         self.training_state.resume(trainer, self.model.proposal_sampler)
         # A run that goes on from a checkpoint is diagnosed anew at its own end.

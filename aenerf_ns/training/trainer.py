@@ -28,7 +28,6 @@ from aenerf_ns.errors import DataError, errors_as_one_line
 from aenerf_ns.files.output_paths import require_writable
 from aenerf_ns.training import framework
 from aenerf_ns.training.checkpoints import checkpoint_to_load, step_of, warn_of_later_checkpoints
-from aenerf_ns.training.datamanager import EventDataManager
 from aenerf_ns.training.preflight import require_device
 from aenerf_ns.training.run_record import RunRecord, ScalarWriter
 from aenerf_ns.training.schedules import RelativeCosineSchedulerConfig, RelativeMultiStepSchedulerConfig
@@ -171,7 +170,6 @@ class AENeRFTrainer(Trainer):
             self.callbacks.insert(0, TrainingCallback([places.BEFORE_TRAIN_ITERATION], self._stop_if_asked))
             with _one_line_if_not_written(self.base_dir / "config.yml") as path, atomic_write(path) as partial:
                 # With what the dataset has resolved: opening the run must give the same cameras.
-                assert isinstance(self.pipeline.datamanager, EventDataManager)
                 data = self.pipeline.datamanager.resolved_config()
                 resolved = replace(self.config, pipeline=replace(self.config.pipeline, datamanager=data))  # type: ignore[call-arg]
                 partial.write_text(yaml.dump(resolved), "utf8")
@@ -180,7 +178,6 @@ class AENeRFTrainer(Trainer):
         """Return the optimizers, with lower rates for a spline of poses where the camera's focal length is long."""
         optimizers = deepcopy(self.config.optimizers)
         if self.pipeline.model.config.camera_optimizer.mode == "spline":
-            assert isinstance(self.pipeline.datamanager, EventDataManager)
             focal_length = self.pipeline.datamanager.train_dataset.scene.event_camera.fx
             for name in optimizers.keys() & {"camera_opt", "camera_opt_finer"}:
                 optimizers[name]["optimizer"].lr *= min(_FOCAL_LENGTH / focal_length, 1.0)

@@ -266,7 +266,6 @@ class RecordingPanel(nn.Module):
         aspect = client.camera.aspect
         height = panel.max_res / max(aspect, 1.0)
         camera = self.control.get_camera(round(height), round(height * aspect), client.client_id)
-        assert camera is not None
         model = self._viewer.get_model()
         was_training = model.training
         model.eval()
