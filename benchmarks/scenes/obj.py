@@ -1,7 +1,8 @@
 """Reading OBJ files, with what the furniture needs of the format.
 
-trimesh reads their materials. It would read the rest faster, but fills concave polygons wrongly, and orders triangles
-and their corners otherwise: the scenes would not stay the same. mapbox-earcut would make other triangles of polygons.
+trimesh reads their materials, malformed ones in silence: the assets are pinned. It would read the rest faster, but
+fills concave polygons wrongly, and orders triangles and their corners otherwise: the scenes would not stay the same.
+mapbox-earcut would make other triangles of polygons.
 """
 
 from __future__ import annotations

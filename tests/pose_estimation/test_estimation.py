@@ -6,6 +6,7 @@ import json
 import shutil
 import sqlite3
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -34,7 +35,7 @@ from aenerf_ns.pose_estimation.colmap_workspace import ColmapWorkspace, work_fol
 from aenerf_ns.pose_estimation.from_events import estimate_poses_from_events
 from aenerf_ns.pose_estimation.from_frames import compare_with_truth, estimate_poses
 from aenerf_ns.pose_estimation.picture import draw_poses
-from aenerf_ns.pose_estimation.placement import EstimatedPoses, _sound
+from aenerf_ns.pose_estimation.placement import EstimatedPoses, _refine, _sound
 from aenerf_ns.recording.recording import ReferenceView
 from aenerf_ns.recording.scene import SCENE_KEY
 from aenerf_ns.recording.views import move_views
@@ -138,6 +139,21 @@ def test_colmap_estimates_intrinsics(
     assert found.camera.distortion[1:] == (0.0,) * 4
 
 
+def test_a_lens_is_kept_where_an_adjustment_of_it_fails(
+    video: tuple[Simulation, np.ndarray, list[np.ndarray]], room: SimulationScene, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    _, times, frames = video
+    adjust = ColmapWorkspace.adjust
+
+    def fail(workspace: ColmapWorkspace, *limits: Any, refine_intrinsics: bool = False) -> Any:
+        return pycolmap.Reconstruction() if refine_intrinsics else adjust(workspace, *limits)
+
+    monkeypatch.setattr(ColmapWorkspace, "adjust", fail)
+    found = estimate_poses(frames[:8], times[:8], (160, 120), "frames")
+    assert len(found.trajectory) == 8
+    assert found.camera.fx == pytest.approx(room.intrinsics(160, 120)[0], rel=0.2)
+
+
 @pytest.fixture(scope="module")
 def bare(dataset: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The events of the dataset and the size of its sensor, without lens, frames and poses."""
@@ -218,6 +234,16 @@ def test_a_fragment_does_not_count_as_sound() -> None:
         image.name = f"{index + 10:08d}.png"
     assert _sound({"global": whole, "incremental": fragment}) == {"global": False, "incremental": False}
     assert _sound({"incremental": fragment}) == {"incremental": True}
+
+
+def test_images_that_find_a_place_later_bring_no_break() -> None:
+    model, sound = (model_of(*[range(200)] * count) for count in (49, 50))
+    broken = model_of(*[range(100)] * 20, *[range(100, 200)] * 20, *[range(200)] * 10)
+    for more, expected in ((sound, sound), (broken, model)):
+        workspace = SimpleNamespace(
+            adjust=lambda model, *_: model, triangulate=lambda *_: None, reconstruct=lambda start, more=more: [more]
+        )
+        assert _refine(workspace, model, 50) is expected
 
 
 def test_an_interrupted_search_goes_on(
