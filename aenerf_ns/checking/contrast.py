@@ -100,7 +100,8 @@ def choose_runs(num_events: int, camera: CameraIntrinsics) -> tuple[NDArray[np.i
 def longest_stretches(runs: list[EventStream], window: TimeWindow) -> list[EventStream]:
     """Return the stretches of runs between the gaps of a time window, as many as there are slices at most.
 
-    The events of a slice are warped as one motion, which a gap between the poses would be in.
+    The events of a slice are warped as one motion, which a gap between the poses would be in. Stretches of fewer than
+    MIN_EVENTS events are left out.
     """
     stretches = [run.between(*piece) for run in runs for piece in window.pieces()]
     longest = sorted((part for part in stretches if len(part) >= MIN_EVENTS), key=len)[-_NUM_SLICES:]

@@ -140,7 +140,6 @@ def make_networks(
             nn.init.xavier_uniform_(layer.weight)
             nn.init.zeros_(layer.bias)
     # One network, which every round of proposals evaluates again.
-    size = proposal.num_hidden_layers, proposal.hidden_dim
-    return radiance_field, [
-        DensityField(aabb, spatial_distortion, encoding, proposal_warp, *size, average_init_density)
-    ]
+    layers, width = proposal.num_hidden_layers, proposal.hidden_dim
+    proposals = DensityField(aabb, spatial_distortion, encoding, proposal_warp, layers, width, average_init_density)
+    return radiance_field, [proposals]

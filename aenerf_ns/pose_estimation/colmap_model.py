@@ -39,15 +39,15 @@ def _index(image: Any) -> int:
 def _linked(images: list[Any]) -> list[Any]:
     """Return the largest group of images that holds together: each shares enough points with another, and not with far
     fewer than most do, and with the image before or after it, and is not turned away from both."""
-    shared = _count_shared_points(images)
-    partners = np.asarray((shared >= MIN_POINTS).sum(1)).ravel() - 1
-    is_near = shared.diagonal(1) >= MIN_POINTS
+    links = _count_shared_points(images) >= MIN_POINTS
+    partners = np.asarray(links.sum(1)).ravel() - 1
+    is_near = links.diagonal(1)
     is_held = np.append(is_near, False) | np.append(False, is_near)
     turns = _turns(images, 1)
     # A camera in fast motion turns far from image to image, but then farther still to the next but one.
     is_held[1:-1] &= np.minimum(turns[:-1], turns[1:]) < np.maximum(_turns(images, 2), _MAX_TURN)
     held = np.flatnonzero(is_held & (partners >= min(_SHARE * np.median(partners), _ENOUGH_PARTNERS)))
-    groups = connected_components((shared >= MIN_POINTS)[held][:, held])[1]
+    groups = connected_components(links[held][:, held])[1]
     return [images[i] for i in held[groups == np.bincount(groups).argmax()]] if len(held) else []
 
 

@@ -6,14 +6,12 @@ import json
 import shutil
 import sqlite3
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pycolmap
 import pytest
 import torch
-from helpers.colmap_stand_in import model_of
 from nerfstudio.utils.rich_utils import CONSOLE
 from PIL import Image
 
@@ -35,7 +33,6 @@ from aenerf_ns.pose_estimation.colmap_workspace import ColmapWorkspace, work_fol
 from aenerf_ns.pose_estimation.from_events import estimate_poses_from_events
 from aenerf_ns.pose_estimation.from_frames import compare_with_truth, estimate_poses
 from aenerf_ns.pose_estimation.picture import draw_poses
-from aenerf_ns.pose_estimation.placement import EstimatedPoses, _refine, _sound
 from aenerf_ns.recording.recording import ReferenceView
 from aenerf_ns.recording.scene import SCENE_KEY
 from aenerf_ns.recording.views import move_views
@@ -222,28 +219,6 @@ def test_images_that_a_mapper_lost_are_placed_again(dataset: Path, monkeypatch: 
     errors = pose_errors(found.trajectory.camera_to_worlds, recording.ground_truth.interpolate(found.frame_times))
     # Measured: 0.6 degrees, on half of the path.
     assert errors["rotation_error_degrees"] < 2
-
-
-def test_a_fragment_does_not_count_as_sound() -> None:
-    # The whole path has a gap, across which nothing is shared.
-    whole, fragment = (
-        model_of(*[range(100)] * 20, *[range(100, 200)] * 20, *[range(200)] * 10),
-        model_of(*[range(100)] * 5),
-    )
-    for index, image in list(whole.images.items())[20:]:
-        image.name = f"{index + 10:08d}.png"
-    assert _sound({"global": whole, "incremental": fragment}) == {"global": False, "incremental": False}
-    assert _sound({"incremental": fragment}) == {"incremental": True}
-
-
-def test_images_that_find_a_place_later_bring_no_break() -> None:
-    model, sound = (model_of(*[range(200)] * count) for count in (49, 50))
-    broken = model_of(*[range(100)] * 20, *[range(100, 200)] * 20, *[range(200)] * 10)
-    for more, expected in ((sound, sound), (broken, model)):
-        workspace = SimpleNamespace(
-            adjust=lambda model, *_: model, triangulate=lambda *_: None, reconstruct=lambda start, more=more: [more]
-        )
-        assert _refine(workspace, model, 50) is expected
 
 
 def test_an_interrupted_search_goes_on(
@@ -486,30 +461,3 @@ def test_align_all_frames_without_majority(truth: torch.Tensor) -> None:
     expected = align(poses, truth)(poses)
     torch.testing.assert_close(aligned.camera_to_worlds, expected, rtol=0, atol=1e-12)
     assert errors["misplaced_frames"] > 30
-
-
-def test_report_lost_frames_and_fragments(truth: torch.Tensor) -> None:
-    times = FRAME * np.arange(10)
-    found = EstimatedPoses(times, Trajectory(times[[1, 2, 5, 6, 8]], truth[:5]), SMALL, [5, 3], 100, 0.5, 200.0, 1.0)
-    assert found.gaps() == [(0, 0, 1), (3 * FRAME, 4 * FRAME, 2), (7 * FRAME, 7 * FRAME, 1), (9 * FRAME, 9 * FRAME, 1)]
-    report = found.report()
-    assert json.loads(json.dumps(report)) == report
-    assert (report["frames"], report["registered_frames"], report["registered_fraction"]) == (10, 5, 0.5)
-    assert report["model_sizes"] == [5, 3]
-    assert "5 of 10 frames registered in the largest of 2 models" in found.summary()
-    assert "0.120 to 0.160 s (2)" in found.summary()
-    # Across one lost frame poses are interpolated: two poses are then two frames apart.
-    strict = dataclasses.replace(found, max_lost=1)
-    assert [estimated.max_pose_gap() for estimated in (found, strict)] == [None, 2 * FRAME]
-    assert f"at most {2 * FRAME * 1e-9:.3g} s apart poses are interpolated" in strict.summary()
-    assert dataclasses.replace(found, max_lost=2).max_pose_gap() is None
-    many = Trajectory(FRAME * np.arange(0, 40, 2), truth[:20])
-    told = dataclasses.replace(found, frame_times=FRAME * np.arange(40), trajectory=many).summary()
-    assert told.count("(1)") == 10
-    assert "and 10 more runs" in told
-    torn = dataclasses.replace(found, breaks=(FRAME, 5 * FRAME))
-    assert torn.report()["breaks_ns"] == [FRAME, 5 * FRAME]
-    assert "The path breaks after 0.040 s, 0.200 s: two frames" in torn.summary()
-    whole = dataclasses.replace(found, frame_times=times[[1, 2, 5, 6, 8]], model_sizes=[5])
-    assert whole.gaps() == []
-    assert "\n" not in whole.summary()

@@ -23,7 +23,7 @@ from aenerf_ns.report.view_pictures import ViewPictures
 HOSTILE = '<script>alert("&")</script>'
 
 
-# In place of warped events, of which a page only needs the picture.
+# Stands in for warped events. A page needs only their picture.
 DRAWING = SimpleNamespace(picture=lambda: np.zeros((100, 2000, 3), np.uint8))
 
 
