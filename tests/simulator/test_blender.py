@@ -165,6 +165,19 @@ def test_refuse_camera(blend: Path, lens: dict, problem: str) -> None:
     assert open_scene(str(blend.parent / "scene.json")).focal_ratio == 0.62
 
 
+def test_a_marker_that_switches_to_another_camera(blend: Path) -> None:
+    animate()
+    scene, other = bpy.context.scene, bpy.data.objects.new("other", bpy.data.cameras.new("other"))
+    scene.collection.objects.link(other)
+    for frame, camera in ((11, other), (15, scene.camera)):
+        scene.timeline_markers.new("cut", frame=frame).camera = camera
+    saved(blend.parent)
+    with pytest.raises(DataError, match="the camera or its lens changes"):
+        BlenderRenderer(blend)
+    depth = BlenderRenderer(blend, follow=False).render(OVERHEAD, LENS, 32, 3, 1)[1]
+    assert {*depth.ravel().round(5).tolist()} == {2, 3}
+
+
 def test_textures(blend: Path, tmp_path: Path) -> None:
     def add_texture(name: str) -> None:
         nodes = bpy.data.materials["floor"].node_tree.nodes
