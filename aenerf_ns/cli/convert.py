@@ -289,11 +289,14 @@ def _with_poses(
         if len(knots) > 1:
             covered = Trajectory(knots, trajectory.interpolate(knots))
             aligned, errors = compare_with_truth(covered, truth.interpolate(knots))
-            paths = {"given": truth.interpolate(knots).numpy(), "estimated": aligned.camera_to_worlds.numpy()}
+            name, of_name = "true", "ground truth"
+            if capture.ground_truth is None:
+                name, of_name = "given", "given poses, which are kept as ground truth"
+            paths = {name: truth.interpolate(knots).numpy(), "estimated": aligned.camera_to_worlds.numpy()}
             report["errors"] = errors
             say(
-                f"Compared with the given poses, which are kept as ground truth: mean errors "
-                f"{errors['rotation_error_degrees']:.2f} degrees and {errors['translation_error']:.2g} of their units."
+                f"Compared with the {of_name}: mean errors {errors['rotation_error_degrees']:.2f} degrees and "
+                f"{errors['translation_error']:.2g} of their units."
             )
             recording = replace(capture, ground_truth=truth, **new)
             return recording, report, found.draw and found.draw(paths)

@@ -185,6 +185,10 @@ def test_poses_from_frames_replace_the_given_ones(ecd: Path, tmp_path: Path, mon
         with_truth = convert(ecd, tmp_path / "with_truth", poses="colmap")
     assert "z is up if the camera was held level, and the scale is arbitrary" in " ".join(output.get().split())
     assert "3 of 4 frames registered" in output.get()
+    assert "Compared with the given poses, which are kept as ground truth: " in output.get()
+    with CONSOLE.capture() as output:
+        convert(tmp_path / "with_truth", tmp_path / "again", poses="colmap")
+    assert "Compared with the ground truth: " in output.get()
     times = [50_000_000, 150_000_000, 250_000_000]
     assert with_truth.trajectory.times.tolist() == times
     truth = read_tum_trajectory(ecd / "groundtruth.txt")
