@@ -285,6 +285,17 @@ def test_means_are_over_common_runs() -> None:
         assert {row[1] for row in rows} == {"20.00 / -"}
 
 
+def test_rows_of_few_scenes_leave_the_means_of_the_others() -> None:
+    plan = small_plan(scale="medium", tables=("methods",), methods=("aenerf",), speeds=("hard",), seeds=(1,))
+    worth = {"room": 20.0, "object": 30.0}
+    figures = [figures_of(run, worth[run.dataset.scene], "large", (1.0, 0.5)) for run in plan]
+    text = tables.report([one for one in figures if one["row"] not in POSES_OF_EVENTS or one["scene"] == "room"], {})
+    all_scenes, few = text.split("## Poses that the events refine or find")
+    assert all_scenes.count("| 25.00 / - |") == 3
+    assert few.split("\n## ")[0].count("| 20.00 / - |") == 5
+    assert "events refine" not in tables.report([one for one in figures if one["row"] not in POSES_OF_EVENTS], {})
+
+
 def test_report_lists_colmap_sequences() -> None:
     run, other = small_plan(poses="colmap", tables=("losses",), seeds=(1,))[:2]
     errors = {"rotation_error_degrees": 0.5, "translation_error": 0.04, "misplaced_frames": 2}
