@@ -44,15 +44,15 @@ def report(figures: Sequence[Figures], missing: Mapping[str, str]) -> str:
     all_rows, losses = ([run for run in figures if run["table"] == table] for table in ("methods", "losses"))
     # Few scenes have further rows, and the means of the others are over more.
     methods = [run for run in all_rows if run["row"] not in plan.POSES_OF_EVENTS]
-    sequences_of_events = {(run["scene"], run["speed"]) for run in all_rows if run not in methods}
+    further = {(run["scene"], run["speed"]) for run in all_rows if run["row"] in plan.POSES_OF_EVENTS}
     parts = ["# Benchmark", _conditions(figures), _TEST_POSES]
     if missing:
         parts.append(f"**Not complete:** {len(missing)} of {len(missing) + len(figures)} runs are missing.")
     note = "Means over what all methods of a column have in common."
     if methods:
         parts += ["## Novel views (the paper's table 1)", note, methods_table(methods)]
-    if sequences_of_events:
-        beside = [run for run in all_rows if (run["scene"], run["speed"]) in sequences_of_events]
+    if further:
+        beside = [run for run in all_rows if (run["scene"], run["speed"]) in further]
         parts += ["## Poses that the events refine or find", note, methods_table(beside)]
     if any(run["row"] not in _OWN_ROWS for run in methods):
         parts += ["## Methods of other papers", *peers_parts(methods)]
