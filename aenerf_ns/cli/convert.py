@@ -284,14 +284,13 @@ def _with_poses(
     )
     say_scene_box(found.scene_box)
     if isinstance(capture, Recording):
-        truth = capture.reference_trajectory
+        truth, name, of_name = capture.reference_trajectory, "true", "ground truth"
+        if capture.ground_truth is None:
+            name, of_name = "given", "given poses, which are kept as ground truth"
         knots = trajectory.knots_known_to(truth)
         if len(knots) > 1:
             covered = Trajectory(knots, trajectory.interpolate(knots))
             aligned, errors = compare_with_truth(covered, truth.interpolate(knots))
-            name, of_name = "true", "ground truth"
-            if capture.ground_truth is None:
-                name, of_name = "given", "given poses, which are kept as ground truth"
             paths = {name: truth.interpolate(knots).numpy(), "estimated": aligned.camera_to_worlds.numpy()}
             report["errors"] = errors
             say(
@@ -301,8 +300,8 @@ def _with_poses(
             recording = replace(capture, ground_truth=truth, **new)
             return recording, report, found.draw and found.draw(paths)
         say(
-            f"The given poses, from {truth.start} to {truth.end} ns, are of another time than the estimated ones, from "
-            f"{trajectory.start} to {trajectory.end} ns: they are left out."
+            f"The {name} poses, from {truth.start} to {truth.end} ns, are of another time than the estimated ones, "
+            f"from {trajectory.start} to {trajectory.end} ns: they are left out."
         )
     if not capture.has_own_frames:
         if images:

@@ -21,6 +21,8 @@ MIN_POINTS = 15
 """Points that a frame is placed by, at least."""
 # Other frames with which a frame shares MIN_POINTS, at least: a share of the median, but no more than this.
 _SHARE, _ENOUGH_PARTNERS = 0.25, 5
+# Frames of a part of the path, at least: COLMAP drops shorter pieces.
+_SHORTEST_PART = 10
 # Degrees that a camera turns from one frame to the next, at most.
 _MAX_TURN = 30.0
 
@@ -53,11 +55,16 @@ def _linked(images: list[Any]) -> list[Any]:
 
 def _count_shared_points(images: list[Any]) -> csr_array:
     """Return the (N, N) numbers of points that two images both see."""
+    sees = _sees(images)
+    return sees @ sees.T
+
+
+def _sees(images: list[Any]) -> csr_array:
+    """Return for (N, P) images and points 1 where the image sees the point."""
     points = [[point.point3D_id for point in image.points2D if point.has_point3D()] for image in images]
     rows = np.repeat(np.arange(len(images)), [len(seen) for seen in points])
     columns = np.unique(np.concatenate(points), return_inverse=True)[1]
-    sees = csr_array((np.ones(len(rows)), (rows, columns)))
-    return sees @ sees.T
+    return csr_array((np.ones(len(rows)), (rows, columns)))
 
 
 def _turns(images: list[Any], step: int) -> NDArray[np.float64]:
@@ -96,10 +103,27 @@ def is_sound(model: Any, max_pixels: float) -> bool:
 
 
 def breaks_of(model: Any) -> list[int]:
-    """Return the indices of frames that have a pose, as the next frame has, but share few points with it."""
+    """Return the indices of frames that have a pose, and after which the path breaks.
+
+    The next frame has a pose and shares few points with it. Or few points hold the parts before and after it together:
+    those that two frames or more of each part see. Such a part may be degrees off, though its tracks fit
+    (benchmarks/LOG.md).
+    """
     images = placed_images(model)
     indices = np.array([_index(image) for image in images])
-    return indices[:-1][_breaks(images) & (np.diff(indices) == 1)].tolist()
+    breaks = _breaks(images) & (np.diff(indices) == 1)
+    inside = slice(_SHORTEST_PART - 1, 1 - _SHORTEST_PART)
+    breaks[inside] |= _count_holding_points(images)[inside] < MIN_POINTS
+    return indices[:-1][breaks].tolist()
+
+
+def _count_holding_points(images: list[Any]) -> NDArray[np.int64]:
+    """Return for all images but the last how many points two images or more up to it and after it see."""
+    sees = _sees(images).tocsc()
+    first, end = sees.indptr[:-1], sees.indptr[1:]
+    first, end = first[end - first >= 4], end[end - first >= 4]
+    changes = [np.bincount(sees.indices[which], minlength=len(images)) for which in (first + 1, end - 2)]
+    return np.cumsum(changes[0] - changes[1])[:-1]
 
 
 def _breaks(images: list[Any]) -> NDArray[np.bool_]:

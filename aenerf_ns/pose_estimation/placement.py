@@ -67,7 +67,8 @@ class EstimatedPoses:
         images: what the frames are, for people to read.
         mapper: COLMAP's mapper whose model was taken, incremental or global.
         agreement: share of the matches kept apart that fit the poses; None where none were kept apart.
-        breaks: times in nanoseconds of the frames after which the path breaks: the parts may lie the wrong way round.
+        breaks: times in nanoseconds of the frames after which the path breaks
+            (:func:`~aenerf_ns.pose_estimation.colmap_model.breaks_of`).
         max_lost: frames in a row without a pose across which poses are interpolated; None for any number.
         draw: draws the images, their tracks and paths (:func:`~aenerf_ns.pose_estimation.picture.draw_poses`), given
             the paths; None where the images were not kept.
@@ -137,8 +138,8 @@ class EstimatedPoses:
         if self.breaks:
             times = _shortened([f"{time * 1e-9:.3f} s" for time in self.breaks], "times")
             line += (
-                f"\nThe path breaks after {times}: two {self.images} that follow each other share fewer "
-                f"than {MIN_POINTS} points. Parts may lie the wrong way round."
+                f"\nThe path breaks after {times}: fewer than {MIN_POINTS} points hold the {self.images} before and "
+                "after together. Parts may be degrees off, or lie the wrong way round."
             )
         gaps = [f"{start * 1e-9:.3f} to {end * 1e-9:.3f} s ({count})" for start, end, count in self.gaps()]
         if gaps:

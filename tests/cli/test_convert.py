@@ -254,6 +254,15 @@ def test_given_poses_of_another_time_are_left_out(ecd: Path, tmp_path: Path, mon
     assert convert(ecd, tmp_path / "again", poses="events", format="ecd-data").max_pose_gap == 100_000_000
 
 
+def test_true_poses_of_another_time_are_left_out(native: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    find_three_poses(monkeypatch, START)
+    truth = read_tum_trajectory(native / "trajectory_ground_truth.txt")
+    write_tum_trajectory(truth.source, Trajectory(truth.times + 10**12, truth.camera_to_worlds))
+    with CONSOLE.capture() as output:
+        assert convert(native, tmp_path / "found", poses="events").ground_truth is None
+    assert f"The true poses, from {START + 10**12} to " in output.get()
+
+
 @pytest.mark.parametrize(
     ("poses", "search"), [("events", "from_events.estimate_poses_from_events"), ("refined", "from_poses.refine_poses")]
 )

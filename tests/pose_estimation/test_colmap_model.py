@@ -67,6 +67,19 @@ def test_a_path_breaks_where_frames_share_no_points() -> None:
     assert (is_sound(torn, 4.0), breaks_of(torn)) == (False, [5])
 
 
+@pytest.mark.parametrize(("num_held", "num_frames", "breaks"), [(14, 10, [9]), (15, 10, []), (14, 9, [])])
+def test_a_path_breaks_where_few_points_hold_its_parts_together(
+    num_held: int, num_frames: int, breaks: list[int]
+) -> None:
+    # Frames beside the break share more points, but one of the two sees each of these for the only time in its part.
+    before, after = range(100), range(100 - num_held, 200)
+    bridge = [*after, *range(200, 220)]
+    model = model_of(*[before] * (num_frames - 1), [*before, *range(200, 220)], bridge, *[bridge] * 9)
+    assert breaks_of(model) == breaks
+    # As linked frames, all have poses.
+    assert len(poses_of(model)) == num_frames + 10
+
+
 def test_worlds_stand_upright(monkeypatch: pytest.MonkeyPatch) -> None:
     # These frames are no video.
     monkeypatch.setattr("aenerf_ns.pose_estimation.colmap_model._MAX_TURN", 180.0)

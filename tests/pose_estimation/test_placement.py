@@ -59,7 +59,7 @@ def test_report_lost_frames_and_fragments() -> None:
     assert "and 10 more runs" in told
     torn = dataclasses.replace(found, breaks=(FRAME, 5 * FRAME))
     assert torn.report()["breaks_ns"] == [FRAME, 5 * FRAME]
-    assert "The path breaks after 0.040 s, 0.200 s: two frames" in torn.summary()
+    assert "The path breaks after 0.040 s, 0.200 s: fewer than 15 points hold the frames" in torn.summary()
     whole = dataclasses.replace(found, frame_times=times[[1, 2, 5, 6, 8]], model_sizes=[5])
     assert whole.gaps() == []
     assert "\n" not in whole.summary()
