@@ -122,8 +122,9 @@ def _count_holding_points(images: list[Any]) -> NDArray[np.int64]:
     sees = _sees(images).tocsc()
     first, end = sees.indptr[:-1], sees.indptr[1:]
     first, end = first[end - first >= 4], end[end - first >= 4]
-    changes = [np.bincount(sees.indices[which], minlength=len(images)) for which in (first + 1, end - 2)]
-    return np.cumsum(changes[0] - changes[1])[:-1]
+    begins = np.bincount(sees.indices[first + 1], minlength=len(images))
+    ends = np.bincount(sees.indices[end - 2], minlength=len(images))
+    return np.cumsum(begins - ends)[:-1]
 
 
 def _breaks(images: list[Any]) -> NDArray[np.bool_]:
