@@ -37,7 +37,18 @@ class Similarity:
         return Similarity(scale, rotation, -scale * (rotation @ self.translation))
 
 
-def align(poses: Tensor, reference: Tensor, with_scale: bool = True, with_orientations: bool = True) -> Similarity:
+# Rounds of weighted least squares. After ten, poses by COLMAP move by less than 1e-4 degrees. And the distance, in
+# radians and extents, below which all cameras are equally good.
+_ROUNDS, _NEGLIGIBLE = 20, 1e-4
+
+
+def align(
+    poses: Tensor,
+    reference: Tensor,
+    with_scale: bool = True,
+    with_orientations: bool = True,
+    weights: Tensor | None = None,
+) -> Similarity:
     """Return the least-squares map of poses onto reference poses of the same cameras at the same times.
 
     Positions alone leave the rotation uncertain, and on a straight line undetermined. So each camera contributes its
@@ -50,6 +61,7 @@ def align(poses: Tensor, reference: Tensor, with_scale: bool = True, with_orient
         with_scale: Sim(3) if true, else SE(3).
         with_orientations: if false, positions alone count (Umeyama 1991), as is usual for the absolute trajectory
             error.
+        weights: (N,) of the cameras' squared errors, or None for equal ones.
 
     Returns:
         The map from the world of ``poses`` to the world of ``reference``.
@@ -66,24 +78,51 @@ def align(poses: Tensor, reference: Tensor, with_scale: bool = True, with_orient
         True
     """
     poses, reference = poses.double(), reference.double()
-    mean, reference_mean = poses[..., 3].mean(0), reference[..., 3].mean(0)
+    weights = poses.new_ones(len(poses)) if weights is None else weights
+    weights = (weights / weights.sum())[:, None]
+    mean, reference_mean = (weights * poses[..., 3]).sum(0), (weights * reference[..., 3]).sum(0)
     centered, reference_centered = poses[..., 3] - mean, reference[..., 3] - reference_mean
-    correlation = reference_centered.mT @ centered
+    variance, reference_variance = ((weights * part.square()).sum() for part in (centered, reference_centered))
+    correlation = (weights * reference_centered).mT @ centered
     if with_orientations:
-        spread = (reference_centered.norm() * centered.norm()).clamp_min(1e-30) / len(poses)
-        correlation = correlation / spread + (reference[..., :3] @ poses[..., :3].mT).sum(0)
+        spread = (variance * reference_variance).sqrt().clamp_min(1e-30)
+        correlation = correlation / spread + (weights[..., None] * (reference[..., :3] @ poses[..., :3].mT)).sum(0)
     u, _, vh = torch.linalg.svd(correlation)
     sign = torch.ones(3, dtype=torch.float64, device=poses.device)
     sign[2] = torch.linalg.det(u @ vh).sign()
     rotation = u @ (sign[:, None] * vh)
     scale = torch.ones((), dtype=torch.float64, device=poses.device)
     # Positions that do not spread give no scale.
-    if with_scale and min(centered.norm(), reference_centered.norm()) > 1e-12:
-        scale = (reference_centered * (centered @ rotation.mT)).sum() / centered.square().sum()
+    if with_scale and min(variance, reference_variance) > 1e-24:
+        scale = (weights * reference_centered * (centered @ rotation.mT)).sum() / variance
         if scale <= 0:
             # The positions contradict the orientations. A negative factor would be a reflection.
-            scale = reference_centered.norm() / centered.norm()
+            scale = (reference_variance / variance).sqrt()
     return Similarity(scale, rotation, reference_mean - scale * (rotation @ mean))
+
+
+def align_most(poses: Tensor, reference: Tensor) -> Similarity:
+    """Return the Sim(3) that leaves the least sum of the cameras' distances.
+
+    :func:`align` leaves the least sum of their squares, so a few misplaced cameras move all others away from their
+    places. Here they hardly do. A camera's distance counts the same parts, and the least squares are repeated with
+    weights of 1 / distance (Weiszfeld's algorithm).
+
+    Args:
+        poses: (N, 3, 4) camera-to-world.
+        reference: (N, 3, 4) camera-to-world, with the same camera axes.
+
+    Returns:
+        The map from the world of ``poses`` to the world of ``reference``.
+    """
+    poses, reference = poses.double(), reference.double()
+    extent = (reference[..., 3] - reference[..., 3].mean(0)).square().sum(-1).mean().sqrt().clamp_min(1e-30)
+    similarity = align(poses, reference)
+    for _ in range(_ROUNDS):
+        differences = similarity(poses) - reference
+        squares = differences[..., :3].square().sum((1, 2)) + (differences[..., 3] / extent).square().sum(-1)
+        similarity = align(poses, reference, weights=1 / squares.sqrt().clamp_min(_NEGLIGIBLE))
+    return similarity
 
 
 def pose_errors(poses: Tensor, reference: Tensor) -> dict[str, float]:

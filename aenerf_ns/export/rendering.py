@@ -12,7 +12,7 @@ from nerfstudio.cameras.cameras import Cameras
 from numpy.typing import NDArray
 from torch import Tensor
 
-from aenerf_ns.camera.alignment import align
+from aenerf_ns.camera.alignment import align_most
 from aenerf_ns.camera.intrinsics import CameraIntrinsics
 from aenerf_ns.camera.trajectory import homogeneous
 from aenerf_ns.errors import DataError
@@ -61,7 +61,7 @@ def _place_poses(run: TrainedRun, views: list[ReferenceView]) -> Tensor:
     """Compute the poses (N, 4, 4), OpenCV axes, of views in the frame of the corrected poses."""
     correction = run.model.camera_optimizer
     _, corrected, reference = (run.scene.to_recording(poses) for poses in correction.compared_poses())
-    alignment = align(corrected, reference).inverse()
+    alignment = align_most(corrected, reference).inverse()
     given = run.recording.reference_trajectory
     poses = []
     for view in views:

@@ -15,7 +15,7 @@ from nerfstudio.cameras.rays import RayBundle
 from nerfstudio.field_components.encodings import NeRFEncoding
 from torch import Tensor, nn
 
-from aenerf_ns.camera.alignment import Similarity, align, rotation_angle
+from aenerf_ns.camera.alignment import Similarity, align_most, rotation_angle
 from aenerf_ns.camera.metadata_keys import CAMERA_DIRECTIONS, REFERENCE_SECONDS, TRAJECTORY_SECONDS
 from aenerf_ns.camera.rotation import TwistExponential
 from aenerf_ns.camera.trajectory import Trajectory, homogeneous
@@ -288,12 +288,12 @@ class PoseCorrection(CameraOptimizer):
         return torch.cat([translation + torch.linalg.cross(base[..., 3], rotation), rotation], -1)
 
     def alignment(self) -> Similarity:
-        """Return the Sim(3) that best maps the corrected trajectory to the true one.
+        """Return the Sim(3) that best maps the corrected trajectory to the true one, whatever a few poses say.
 
         Where the true trajectory is not known, the estimated one takes its place.
         """
         _, corrected, reference = self.compared_poses()
-        return align(corrected, reference)
+        return align_most(corrected, reference)
 
     def compared_poses(self) -> tuple[Tensor, Tensor, Tensor]:
         """Return estimated, corrected and reference poses (N, 3, 4) at the same times, in scene units.

@@ -8,7 +8,7 @@ import torch
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from aenerf_ns.camera.alignment import align, rotation_angle
+from aenerf_ns.camera.alignment import align, align_most, rotation_angle
 from aenerf_ns.camera.trajectory import homogeneous
 from aenerf_ns.evaluation.run import TrainedRun
 
@@ -54,7 +54,7 @@ def measure_poses(run: TrainedRun) -> RunPoses:
     if true is None:
         # A learned clock does not turn the world.
         references["corrected"] = given.pose(psi.on_clock_of_poses(seconds.to(run.device)).cpu())
-    aligned = {name: align(part, references[name]) for name, part in poses.items()}
+    aligned = {name: align_most(part, references[name]) for name, part in poses.items()}
     positions = {name: aligned[name](part.double()) for name, part in poses.items()}
     if true is not None:
         positions["true"] = reference

@@ -17,7 +17,7 @@ from helpers.small_pipelines import make_pipeline, make_pipeline_config
 from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.cameras.rays import RayBundle
 
-from aenerf_ns.camera.alignment import Similarity, align, pose_errors, rotation_angle
+from aenerf_ns.camera.alignment import Similarity, align, align_most, pose_errors, rotation_angle
 from aenerf_ns.camera.intrinsics import CameraIntrinsics
 from aenerf_ns.camera.metadata_keys import REFERENCE_SECONDS
 from aenerf_ns.camera.noise import perturb
@@ -55,6 +55,21 @@ def test_alignment_recovers_a_similarity(with_orientations: bool, random_poses: 
     for name, value in errors.items():
         # SE(3) cannot take out a scale.
         assert (value < 1e-6) == ("se3" not in name or name == "rotation_error_degrees_se3"), name
+
+
+def test_a_few_misplaced_cameras_do_not_move_the_others(random_poses: torch.Tensor) -> None:
+    reference = make_truth(random_poses).camera_to_worlds
+    poses = reference.clone()
+    # A fifth of the path is turned and shifted as one, as where structure from motion lost the thread.
+    misplaced = len(poses) // 5
+    poses[:misplaced] = some_similarity(scale=1.0)(poses[:misplaced])
+    rest = slice(misplaced, None)
+    errors = {}
+    for method in (align, align_most):
+        placed = method(some_similarity().inverse()(poses), reference)(some_similarity().inverse()(poses))
+        errors[method] = float((placed - reference)[rest].norm(dim=(1, 2)).max())
+    assert errors[align] > 0.1
+    assert errors[align_most] < 1e-3
 
 
 def test_errors_are_those_of_known_displacements(random_poses: torch.Tensor) -> None:
