@@ -11,7 +11,7 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
-from aenerf_ns.camera.alignment import Similarity, align, pose_errors, rotation_angle
+from aenerf_ns.camera.alignment import Similarity, align, align_most, pose_errors, rotation_angle
 from aenerf_ns.camera.intrinsics import CameraIntrinsics
 from aenerf_ns.camera.trajectory import Trajectory
 from aenerf_ns.errors import DataError
@@ -78,9 +78,9 @@ def estimate_poses(
 def compare_with_truth(estimated: Trajectory, truth: Tensor) -> tuple[Trajectory, dict[str, float]]:
     """Map estimated poses to the true world by one Sim(3), and compute their errors.
 
-    Only position, orientation and scale of the whole world are taken from the truth. The similarity aligns positions
-    and orientations (:func:`~aenerf_ns.camera.alignment.align`) of the frames that agree with most other frames. So a
-    few misplaced frames do not turn the world away from the rest. All frames are mapped, and none is removed.
+    Only position, orientation and scale of the whole world are taken from the truth. The similarity aligns the frames
+    that agree with most other frames, by :func:`~aenerf_ns.camera.alignment.align_most`. So a few misplaced frames do
+    not turn the world away from the rest. All frames are mapped, and none is removed.
 
     Args:
         estimated: the estimated poses.
@@ -120,4 +120,4 @@ def _align_majority(poses: Tensor, truth: Tensor) -> Similarity:
     agree = degrees[degrees.median(1).values.argmin()] <= _MISPLACED_DEGREES
     if 2 * agree.sum() <= len(poses):
         return align(poses, truth)
-    return align(poses[agree], truth[agree])
+    return align_most(poses[agree], truth[agree])
