@@ -37,9 +37,12 @@ class Similarity:
         return Similarity(scale, rotation, -scale * (rotation @ self.translation))
 
 
-# Rounds of weighted least squares. After ten, poses by COLMAP move by less than 1e-4 degrees. And the distance, in
-# radians and extents, below which all cameras are equally good.
-_ROUNDS, _NEGLIGIBLE = 20, 1e-4
+# Squared spread of positions that is rounding. Such positions tell nothing.
+_ROUNDING = 1e-24
+# Rounds of weighted least squares. Ten are enough for poses by COLMAP.
+_ROUNDS = 20
+# Distance below which all cameras are equally good.
+_NEGLIGIBLE = 1e-4
 
 
 def align(
@@ -84,16 +87,17 @@ def align(
     centered, reference_centered = poses[..., 3] - mean, reference[..., 3] - reference_mean
     variance, reference_variance = ((weights * part.square()).sum() for part in (centered, reference_centered))
     correlation = (weights * reference_centered).mT @ centered
+    spreads = min(variance, reference_variance) > _ROUNDING
     if with_orientations:
-        spread = (variance * reference_variance).sqrt().clamp_min(1e-30)
-        correlation = correlation / spread + (weights[..., None] * (reference[..., :3] @ poses[..., :3].mT)).sum(0)
+        correlation = correlation / (variance * reference_variance).sqrt() if spreads else torch.zeros_like(correlation)
+        correlation = correlation + (weights[..., None] * (reference[..., :3] @ poses[..., :3].mT)).sum(0)
     u, _, vh = torch.linalg.svd(correlation)
     sign = torch.ones(3, dtype=torch.float64, device=poses.device)
     sign[2] = torch.linalg.det(u @ vh).sign()
     rotation = u @ (sign[:, None] * vh)
     scale = torch.ones((), dtype=torch.float64, device=poses.device)
     # Positions that do not spread give no scale.
-    if with_scale and min(variance, reference_variance) > 1e-24:
+    if with_scale and spreads:
         scale = (weights * reference_centered * (centered @ rotation.mT)).sum() / variance
         if scale <= 0:
             # The positions contradict the orientations. A negative factor would be a reflection.
@@ -102,11 +106,12 @@ def align(
 
 
 def align_most(poses: Tensor, reference: Tensor) -> Similarity:
-    """Return the Sim(3) that leaves the least sum of the cameras' distances.
+    """Return the Sim(3) that leaves nearly the least sum of the cameras' distances.
 
     :func:`align` leaves the least sum of their squares, so a few misplaced cameras move all others away from their
-    places. Here they hardly do. A camera's distance counts the same parts, and the least squares are repeated with
-    weights of 1 / distance (Weiszfeld's algorithm).
+    places. Here they hardly do, unless one lies a hundred extents away. A camera's distance is the root of the squares
+    of its three axes' errors and of its position's, in units of the reference's spread. The least squares are repeated
+    with weights of 1 / distance.
 
     Args:
         poses: (N, 3, 4) camera-to-world.
@@ -116,12 +121,13 @@ def align_most(poses: Tensor, reference: Tensor) -> Similarity:
         The map from the world of ``poses`` to the world of ``reference``.
     """
     poses, reference = poses.double(), reference.double()
-    extent = (reference[..., 3] - reference[..., 3].mean(0)).square().sum(-1).mean().sqrt().clamp_min(1e-30)
+    variance = (reference[..., 3] - reference[..., 3].mean(0)).square().sum(-1).mean()
+    # The positions of a camera that only turns do not count.
+    units = poses.new_tensor([1.0, 1.0, 1.0, 1 / variance.sqrt() if variance > _ROUNDING else 0.0])
     similarity = align(poses, reference)
     for _ in range(_ROUNDS):
-        differences = similarity(poses) - reference
-        squares = differences[..., :3].square().sum((1, 2)) + (differences[..., 3] / extent).square().sum(-1)
-        similarity = align(poses, reference, weights=1 / squares.sqrt().clamp_min(_NEGLIGIBLE))
+        distances = (units * (similarity(poses) - reference)).square().sum((1, 2)).sqrt()
+        similarity = align(poses, reference, weights=1 / distances.clamp_min(_NEGLIGIBLE))
     return similarity
 
 

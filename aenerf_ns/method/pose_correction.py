@@ -288,7 +288,7 @@ class PoseCorrection(CameraOptimizer):
         return torch.cat([translation + torch.linalg.cross(base[..., 3], rotation), rotation], -1)
 
     def alignment(self) -> Similarity:
-        """Return the Sim(3) that best maps the corrected trajectory to the true one, whatever a few poses say.
+        """Return the Sim(3) that best maps most of the corrected trajectory to the true one.
 
         Where the true trajectory is not known, the estimated one takes its place.
         """

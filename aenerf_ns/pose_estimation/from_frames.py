@@ -80,7 +80,8 @@ def compare_with_truth(estimated: Trajectory, truth: Tensor) -> tuple[Trajectory
 
     Only position, orientation and scale of the whole world are taken from the truth. The similarity aligns the frames
     that agree with most other frames, by :func:`~aenerf_ns.camera.alignment.align_most`. So a few misplaced frames do
-    not turn the world away from the rest. All frames are mapped, and none is removed.
+    not turn the world away from the rest. Where no majority agrees, it aligns all by least squares. All frames are
+    mapped, and none is removed.
 
     Args:
         estimated: the estimated poses.

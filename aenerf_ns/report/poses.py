@@ -24,7 +24,8 @@ class RunPoses:
         num_poses: given poses that the true ones cover, where these are known, else all.
         seconds: (N,) since the trajectory's start.
         positions: (N, 3) of the ``estimated``, the ``corrected`` and, where they are known, the ``true`` poses in the
-            recording's world. Aligned to the true trajectory where it is known.
+            recording's world, where the true trajectory is known placed on it by
+            :func:`~aenerf_ns.camera.alignment.align_most`.
         upright: (3, 3) rotation of that world, after which z is up as far as the given poses tell.
         evo: :func:`evo_errors` of the ``estimated`` and the ``corrected`` poses,
             over all of them. None without true poses.

@@ -123,7 +123,7 @@ def error_map(rendered: NDArray[np.uint8], truth: NDArray[np.uint8]) -> NDArray[
 
 def _paths(data: Path, corrected: Path, file: Path) -> Path:
     """Draw the true, the estimated and the corrected path of a run, and the errors of the poses."""
-    from aenerf_ns.camera.alignment import align
+    from aenerf_ns.camera.alignment import align_most
     from aenerf_ns.files.tum_trajectory import read_tum_trajectory
     from aenerf_ns.report.poses import errors_over_time
 
@@ -134,7 +134,7 @@ def _paths(data: Path, corrected: Path, file: Path) -> Path:
         trajectory = read_tum_trajectory(path)
         times = trajectory.knots_covered_by(truth)
         found, reference = trajectory.interpolate(times), truth.interpolate(times)
-        positions[poses] = align(found, reference)(found)[..., 3]
+        positions[poses] = align_most(found, reference)(found)[..., 3]
         errors[poses] = ((times - truth.start).double() * 1e-9, errors_over_time(found, reference))
     return draw_paths(positions, errors, file)
 

@@ -453,6 +453,15 @@ def test_count_misplaced_and_flipped_frames(truth: torch.Tensor) -> None:
     assert errors["rotation_error_degrees"] > 45
 
 
+def test_frames_that_are_off_by_few_degrees_do_not_move_the_others(truth: torch.Tensor) -> None:
+    poses = truth.clone()
+    turn = rotation_from_vector(torch.tensor([0, np.radians(4), 0], dtype=torch.float64))
+    poses[:8] = torch.cat([turn @ truth[:8, :, :3], turn @ truth[:8, :, 3:]], -1)
+    _, errors = compare_with_truth(Trajectory(FRAME * np.arange(40), poses), truth)
+    assert errors["median_rotation_error_degrees"] < 0.01
+    assert errors["largest_rotation_error_degrees"] == pytest.approx(4, abs=0.01)
+
+
 def test_align_all_frames_without_majority(truth: torch.Tensor) -> None:
     # A drift by which no two frames turn the world alike.
     drift = rotation_from_vector(torch.linspace(0, 2.5, 40).double()[:, None] * torch.tensor([1.0, 0, 0]).double())

@@ -58,7 +58,8 @@ def test_alignment_recovers_a_similarity(with_orientations: bool, random_poses: 
 
 
 def test_a_few_misplaced_cameras_do_not_move_the_others(random_poses: torch.Tensor) -> None:
-    reference = make_truth(random_poses).camera_to_worlds
+    truth = make_truth(random_poses)
+    reference = truth.camera_to_worlds
     poses = reference.clone()
     # A fifth of the path is turned and shifted as one, as where structure from motion lost the thread.
     misplaced = len(poses) // 5
@@ -70,6 +71,21 @@ def test_a_few_misplaced_cameras_do_not_move_the_others(random_poses: torch.Tens
         errors[method] = float((placed - reference)[rest].norm(dim=(1, 2)).max())
     assert errors[align] > 0.1
     assert errors[align_most] < 1e-3
+    correction = make_correction(Trajectory(truth.times, poses), truth, mode="off")
+    placed = correction.alignment()(poses)
+    assert float((placed - reference)[rest].norm(dim=(1, 2)).max()) < 1e-3
+
+
+def test_the_positions_of_a_camera_that_only_turns_do_not_count(random_poses: torch.Tensor) -> None:
+    reference = make_truth(random_poses).camera_to_worlds
+    reference[..., 3] = torch.tensor([1.3, 2.1, -0.7])
+    for method in (align, align_most):
+        placed = method(some_similarity().inverse()(reference), reference)(some_similarity().inverse()(reference))
+        torch.testing.assert_close(placed[..., :3], reference[..., :3], rtol=0, atol=1e-9)
+    misplaced = reference.clone()
+    misplaced[:20] = some_similarity(scale=1.0)(misplaced[:20])
+    placed = align_most(misplaced, reference)(misplaced)
+    assert float(rotation_angle(placed, reference)[20:].max()) < 1e-2
 
 
 def test_errors_are_those_of_known_displacements(random_poses: torch.Tensor) -> None:
