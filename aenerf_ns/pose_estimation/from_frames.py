@@ -60,7 +60,8 @@ def estimate_poses(
     """
     times = np.asarray(times, np.int64)
     if len(times) < 3:
-        raise DataError(source, f"{len(times)} frames", "poses can be estimated from three frames or more")
+        remedy = "poses can be estimated from three frames or more; a recording of your own lists them in images.txt"
+        raise DataError(source, f"{len(times)} frames", remedy)
     if len(backward := np.flatnonzero(np.diff(times) <= 0)):
         raise DataError(source, f"frame {backward[0] + 1} is not after the frame before it", "sort the frames by time")
     begin = time.perf_counter()
