@@ -102,7 +102,7 @@ class NativeDataParser(EventDataParser):
 
 def _read_views(path: Path, meta: Transforms, recording: Recording) -> dict[Split, list[ReferenceView]]:
     """Return the images of each split. A frame that has a time but no pose gets the reference trajectory's pose."""
-    truth = recording.ground_truth
+    truth = None if recording.ground_truth is None else recording.ground_truth.time_without_gaps()
     mount = torch.eye(4, dtype=torch.float64)
     if meta.event_camera.T_frame_event is not None or any(frame.transform_matrix is None for frame in meta.frames):
         mount = frame_from_event(path, meta.event_camera, recording.frame_camera)
@@ -120,7 +120,7 @@ def _read_views(path: Path, meta: Transforms, recording: Recording) -> dict[Spli
             pose = rigid_motion(path, f"{key}.transform_matrix", frame.transform_matrix) @ OPENCV_TO_OPENGL
         elif time is None:
             raise DataError(path, f"{key} has neither transform_matrix nor timestamp", "give one of them")
-        elif truth is not None and not truth.start <= time <= truth.end:
+        elif truth is not None and not truth.contains(time):
             continue
         else:
             pose = homogeneous(recording.reference_trajectory.interpolate(time)) @ torch.linalg.inv(mount)

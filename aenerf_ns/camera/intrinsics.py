@@ -40,6 +40,9 @@ _LENS_MODELS: dict[str, LensModel] = {
 # A pixel whose undistorted direction projects back this far off, in pixels, lies where the lens model folds over.
 _MAX_ROUND_TRIP_ERROR = 1e-3
 
+# Nerfstudio's fisheye divides zero by zero at a pixel whose center is this close to the principal point, in pixels.
+_MIN_FROM_CENTER = 1e-3
+
 # 8K film cameras have 33 million pixels.
 _MAX_SIDE, _MAX_PIXELS = 1 << 14, 1 << 25
 _LIMITS = {"fx": (1e-2, 1e6), "fy": (1e-2, 1e6), "cx": (-1e6, 1e6), "cy": (-1e6, 1e6)}
@@ -231,21 +234,23 @@ class CameraIntrinsics:
         return replace(self, width=width, height=height, cx=self.cx - x, cy=self.cy - y)
 
     def cameras(self, camera_to_worlds: Tensor) -> Cameras:
-        """Return Nerfstudio's cameras with this lens.
+        """Return Nerfstudio's cameras with this lens. A fisheye's axis through a pixel's center moves by 0.001 pixels.
 
         Args:
             camera_to_worlds: (N, 3, 4) poses, OpenGL camera axes.
         """
+        fisheye, center = self.lens_model == "fisheye", np.floor([self.cx, self.cy]) + 0.5
+        on_axis = fisheye and (np.abs(center - [self.cx, self.cy]) < _MIN_FROM_CENTER).all()
         return Cameras(
             camera_to_worlds=camera_to_worlds.float(),
             fx=self.fx,
             fy=self.fy,
-            cx=self.cx,
+            cx=float(center[0]) + _MIN_FROM_CENTER if on_axis else self.cx,
             cy=self.cy,
             width=self.width,
             height=self.height,
             distortion_params=get_distortion_params(**self._named_distortion) if any(self.distortion) else None,
-            camera_type=CameraType.FISHEYE if self.lens_model == "fisheye" else CameraType.PERSPECTIVE,
+            camera_type=CameraType.FISHEYE if fisheye else CameraType.PERSPECTIVE,
             # Nerfstudio's renderers write into it.
             metadata={},
         )

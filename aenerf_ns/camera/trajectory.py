@@ -211,6 +211,12 @@ class Trajectory(nn.Module):
         """
         return self._time_without(self.times.diff() > longest_gap if longest_gap is not None else None)
 
+    def time_without_gaps(self) -> TimeWindow:
+        """Return the span of the knots without its gaps, which are those of the spline that are also longer than twice
+        the median segment, because times may tremble."""
+        steps = self.times.diff().double()
+        return self._time_without(is_gap(steps) & (steps > 2 * steps.median()))
+
     def _time_without(self, gaps: Tensor | None) -> TimeWindow:
         """Return the span of the knots without some of the (N - 1,) segments."""
         found = [] if gaps is None else gaps.nonzero()[:, 0].tolist()
@@ -221,13 +227,8 @@ class Trajectory(nn.Module):
         return self.times[(self.times >= start) & (self.times <= end)]
 
     def knots_known_to(self, reference: Trajectory) -> Tensor:
-        """Return the times in nanoseconds of the knots at which a reference trajectory is known: not in its gaps.
-
-        A gap is one of a spline that is also longer than most segments, because times may tremble.
-        """
-        steps = reference.times.diff().double()
-        known = reference._time_without(is_gap(steps) & (steps > 2 * steps.median()))
-        return self.times[torch.from_numpy(known.contains(self.times.cpu().numpy()))]
+        """Return the times in nanoseconds of the knots in a reference trajectory's :meth:`time_without_gaps`."""
+        return self.times[torch.from_numpy(reference.time_without_gaps().contains(self.times.cpu().numpy()))]
 
     def knots_covered_by(self, reference: Trajectory) -> Tensor:
         """Return :meth:`knots_known_to` a reference trajectory.

@@ -73,9 +73,11 @@ class ColorFit:
         index = (torch.arange(count) % len(views))[torch.randperm(count, generator=generator)]
         size = torch.cat([cameras.height, cameras.width], -1)[index]
         pixels = (torch.rand(count, 2, generator=generator) * size).long()
+        usable = views.usable[pixels[:, 0], pixels[:, 1]]
+        index, pixels = index[usable], pixels[usable]
         radiance = None
         if references is not None:
-            image = torch.zeros(count, 3)
+            image = torch.zeros(len(index), 3)
             for view in range(len(views)):
                 rows, columns = pixels[index == view].T
                 image[index == view] = views.get_image_float32(view)[rows, columns, :3]

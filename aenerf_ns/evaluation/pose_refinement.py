@@ -20,7 +20,7 @@ _FIRST_DAMPING, _LESS, _MORE = 1e-2, 0.2, 10.0
 _MIN_DIAGONAL = 1e-9
 
 
-def refine_camera(model: AENeRFModel, camera: Cameras, image: Tensor) -> Cameras:
+def refine_camera(model: AENeRFModel, camera: Cameras, image: Tensor, usable: Tensor) -> Cameras:
     """Move a camera so that its rendering fits its image, while field and color correction stay as they are.
 
     Minimize the squared errors of display values over twists in the camera's frame, by the method of Levenberg and
@@ -31,6 +31,7 @@ def refine_camera(model: AENeRFModel, camera: Cameras, image: Tensor) -> Cameras
         model: in evaluation mode.
         camera: a single perspective camera (1,) of a reference image.
         image: (H, W, 3) reference values in [0, 1].
+        usable: (H, W) whether a pixel has a direction.
 
     Returns:
         The camera (1,) in the scene's frame. It is at the refined pose, or at the first pose where the refined pose has
@@ -39,7 +40,7 @@ def refine_camera(model: AENeRFModel, camera: Cameras, image: Tensor) -> Cameras
     camera = replace(camera, camera_to_worlds=model.camera_optimizer.apply_to_camera(camera), metadata={})
     generator = torch.Generator().manual_seed(0)
     first = homogeneous(camera.camera_to_worlds[0].double())
-    fitted = _Pixels(model, camera, image, generator)
+    fitted = _Pixels(model, camera, image, usable, generator)
     pose, damping = first, _FIRST_DAMPING
     with torch.enable_grad():
         residuals, rays = fitted.residuals(pose)
@@ -60,7 +61,7 @@ def refine_camera(model: AENeRFModel, camera: Cameras, image: Tensor) -> Cameras
             else:
                 damping *= _MORE
     with torch.no_grad():
-        compared = _Pixels(model, camera, image, generator)
+        compared = _Pixels(model, camera, image, usable, generator)
         before, after = (compared.residuals(one)[0].square().sum() for one in (first, pose))
     if after < before:
         camera.camera_to_worlds = pose[None, :3].to(camera.camera_to_worlds)
@@ -70,16 +71,19 @@ def refine_camera(model: AENeRFModel, camera: Cameras, image: Tensor) -> Cameras
 class _Pixels:
     """Random pixels of an (H, W, 3) image in [0, 1], and what a camera with its lens renders there at any pose."""
 
-    def __init__(self, model: AENeRFModel, camera: Cameras, image: Tensor, generator: torch.Generator) -> None:
+    def __init__(
+        self, model: AENeRFModel, camera: Cameras, image: Tensor, usable: Tensor, generator: torch.Generator
+    ) -> None:
         self._model = model
         pixels = (torch.rand(_NUM_RAYS, 2, generator=generator) * torch.tensor(image.shape[:2])).long()
+        pixels = pixels[usable[pixels[:, 0], pixels[:, 1]]]
         # A sensor of one channel is shown as gray, which is three times the same.
         num_channels = model.sensor.num_channels
         chosen = image[pixels[:, 0], pixels[:, 1]].to(model.device)
         self._reference = model.reference_display(chosen)[:, :num_channels]
         origin = torch.eye(4).to(camera.camera_to_worlds)[None, :3]
         self._rays = replace(camera, camera_to_worlds=origin).generate_rays(
-            torch.zeros(_NUM_RAYS, 1, dtype=torch.long, device=model.device), coords=(pixels + 0.5).to(model.device)
+            torch.zeros(len(pixels), 1, dtype=torch.long, device=model.device), coords=(pixels + 0.5).to(model.device)
         )
 
     def residuals(self, pose: Tensor) -> tuple[Tensor, tuple[Tensor, Tensor]]:
@@ -88,7 +92,7 @@ class _Pixels:
         The rays are origins and directions (N, 3) in the world.
         """
         pose = pose.to(self._rays.directions)
-        origins = pose[:3, 3].repeat(_NUM_RAYS, 1)
+        origins = pose[:3, 3].repeat(len(self._rays), 1)
         directions = self._rays.directions @ pose[:3, :3].mT
         if torch.is_grad_enabled():
             origins.requires_grad_()

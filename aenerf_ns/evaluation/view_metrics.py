@@ -51,7 +51,7 @@ def measure_reference_views(
     measured = []
     for name, (camera, batch) in zip(track(names, "Evaluating views"), views, strict=True):
         if refine:
-            camera = refine_camera(model, camera, batch["image"][..., :3])
+            camera = refine_camera(model, camera, batch["image"][..., :3], run.views.usable)
         began = perf_counter()
         outputs = model.get_outputs_for_camera(camera)
         metrics, pictures = model.get_image_metrics_and_images(outputs, batch)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import torch
 from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor, nn
@@ -29,12 +31,14 @@ class ImageMetrics:
         self._lpips: nn.Module | None = None
         self.lpips_absent: str | None = None if with_lpips else "not asked for (--pipeline.model.lpips True)"
 
-    def __call__(self, predicted: Tensor, reference: Tensor) -> dict[str, float]:
+    def __call__(self, predicted: Tensor, reference: Tensor, mask: Tensor | None = None) -> dict[str, float]:
         """Return the metrics of display values in [0, 1] by their names.
 
         Args:
             predicted: (H, W, 3).
             reference: (H, W, 3).
+            mask: (H, W, 1) the pixels that count, by default all. SSIM and LPIPS, which look at areas, take the others
+                for equal.
 
         Raises:
             DataError: the image is smaller than SSIM's window.
@@ -46,9 +50,13 @@ class ImageMetrics:
         # Imported lazily: every ns-* command imports this module, and torchmetrics is slow to import.
         from torchmetrics.functional.image import peak_signal_noise_ratio, structural_similarity_index_measure
 
+        share = 1.0
+        if mask is not None:
+            predicted, share = torch.where(mask.to(predicted.device), predicted, reference), float(mask.float().mean())
         predicted, reference = (image.moveaxis(-1, 0)[None].float() for image in (predicted, reference))
+        psnr = float(peak_signal_noise_ratio(predicted, reference, data_range=1.0)) + 10 * math.log10(share)
         metrics = {
-            "psnr": min(float(peak_signal_noise_ratio(predicted, reference, data_range=1.0)), _MAX_PSNR),
+            "psnr": min(psnr, _MAX_PSNR),
             "ssim": float(torch.as_tensor(structural_similarity_index_measure(predicted, reference, data_range=1.0))),
         }
         if self._lpips is None and self.lpips_absent is None:

@@ -358,7 +358,7 @@ class AENeRFModel(Model):
             "accumulation": colormaps.apply_colormap(outputs["accumulation"]),
             "depth": colormaps.apply_depth_colormap(outputs["depth"], accumulation=outputs["accumulation"]),
         }
-        return self.image_metrics(predicted, reference), images
+        return self.image_metrics(predicted, reference, batch.get("mask")), images
 
     @torch.no_grad()
     def render_rays(self, rays: RayBundle, *names: str) -> list[Tensor]:

@@ -171,11 +171,12 @@ class EventDataParser(DataParser):
         if ground_truth is not None:
             ground_truth = ground_truth.transform(to_scene)
             trajectory.knots_covered_by(ground_truth)
+        camera = recording.event_camera if split == "train" else recording.frame_camera
         if split == "train":
             times, images = viewer_cameras(trajectory, recording.reference_views["train"])
             for file in images.values():
                 check_image(file, recording.frame_camera)
-            cameras = recording.event_camera.cameras(trajectory.interpolate(times))
+            cameras = camera.cameras(trajectory.interpolate(times))
             cameras.metadata[TRAJECTORY_SECONDS] = trajectory.seconds(times)[:, None]
             frames = _frames(recording, window)
         else:
@@ -185,7 +186,7 @@ class EventDataParser(DataParser):
             poses = torch.stack([v.camera_to_world for v in views]) if views else torch.zeros(0, 4, 4).double()
             poses = to_scene(poses)
             _check_distance(poses, trajectory if ground_truth is None else ground_truth)
-            cameras = recording.frame_camera.cameras(poses)
+            cameras = camera.cameras(poses)
             cameras.metadata[REFERENCE_SECONDS] = seconds_on_trajectory(views, trajectory)
             times, images = torch.zeros(0, dtype=torch.int64), {i: view.file for i, view in enumerate(views)}
             frames = ()
@@ -199,6 +200,7 @@ class EventDataParser(DataParser):
             event_file=recording.event_file,
             sensor=recording.sensor,
             window=window,
+            camera=camera,
             camera_times=times,
             has_image=[index in images for index in range(len(cameras))],
             image_encoding=recording.image_encoding,
@@ -283,9 +285,13 @@ class EventDataParser(DataParser):
         # The framework takes float32, which rounds positions far from the origin, such as those of a map.
         center = poses[:, :3, 3].mean(0) * (self.config.center_method != "none")
         poses[:, :3, 3] -= center
-        oriented, transform = auto_orient_and_center_poses(
-            poses.float(), method=self.config.orientation_method, center_method=self.config.center_method
-        )
+        try:
+            oriented, transform = auto_orient_and_center_poses(
+                poses.float(), method=self.config.orientation_method, center_method=self.config.center_method
+            )
+        except torch.linalg.LinAlgError as error:
+            problem = "all cameras look in one direction and have no focus"
+            raise DataError(trajectory.source, problem, "give --center-method poses") from error
         transform = transform.double()
         transform[:, 3] -= transform[:, :3] @ center
         scale = self.config.scale_factor

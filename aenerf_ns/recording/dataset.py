@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import zlib
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import torch
 from nerfstudio.data.datasets.base_dataset import InputDataset
 from nerfstudio.utils.rich_utils import CONSOLE
 from numpy.typing import NDArray
@@ -43,6 +44,15 @@ class EventDataset(InputDataset):
         seconds since the start of the estimated trajectory, NaN for images off the trajectory."""
         seconds: Tensor = self._dataparser_outputs.cameras.metadata[REFERENCE_SECONDS]
         return seconds[:, 0]
+
+    @cached_property
+    def usable(self) -> Tensor:
+        """(height, width) whether the lens model gives a pixel of the split's cameras a direction."""
+        return torch.from_numpy(self.scene.camera.pixel_directions()[1])
+
+    def get_metadata(self, data: dict[str, Any]) -> dict[str, Any]:
+        """Return the framework's mask (height, width, 1) of the pixels to compare: those that have a direction."""
+        return {"mask": self.usable[..., None]}
 
     @cached_property
     def polarity_drift(self) -> PolarityDrift:

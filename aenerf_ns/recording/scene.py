@@ -28,6 +28,7 @@ class SceneRecording:
         frame: maps the recording's world, in the units of its poses, to the scene's.
         trajectory: the estimated trajectory of the event camera, camera-to-world, OpenGL camera axes, scene units.
         ground_truth: the true trajectory, with the same conventions, or None where it is not known.
+        camera: of the split's pictures: the event camera in the train split, else the frame camera.
         window: the time that is used: the time that both events and poses cover, without the gaps of the poses.
         camera_times: (N,) times of the training cameras in nanoseconds; none for the other splits.
         has_image: whether each camera of the split has an image.
@@ -44,6 +45,7 @@ class SceneRecording:
     event_file: EventFile
     sensor: SensorModel
     window: TimeWindow
+    camera: CameraIntrinsics
     camera_times: Tensor
     has_image: list[bool]
     image_encoding: ImageEncoding

@@ -98,14 +98,15 @@ def views_on_trajectory(
     event_from_frame: Tensor | None = None,
     max_pose_gap: int | None = None,
 ) -> dict[Split, list[ReferenceView]]:
-    """Place images at the interpolated poses of their times. Images taken outside the span of the poses are left out.
+    """Place images at the interpolated poses of their times. Images taken outside the poses or in a gap are left out.
 
     Args:
         images: times in nanoseconds, and files.
         trajectory: of the event camera, camera-to-world, OpenCV camera axes.
         event_from_frame: (4, 4) float64, takes points from the frame camera's to the event camera's coordinates. None:
             one sensor takes both.
-        max_pose_gap: nanoseconds; an image between poses that are further apart is left out.
+        max_pose_gap: nanoseconds; an image between poses that are further apart is left out. None: those in the gaps of
+            :meth:`~aenerf_ns.camera.trajectory.Trajectory.time_without_gaps` are.
 
     Returns:
         All views as train views, and the same alternating between the validation and the test split.
@@ -113,13 +114,14 @@ def views_on_trajectory(
     times = [time for time, _ in images]
     if images:
         require_distinct_times(times, images[0][1].parent)
-    known = trajectory.known_time(max_pose_gap)
+    known = trajectory.time_without_gaps() if max_pose_gap is None else trajectory.known_time(max_pose_gap)
     kept = [(time, file) for time, file in images if known.contains(time)]
     if len(kept) <= max(1, len(images) // 10):
         require_seconds(times, images[0][1].parent if images else Path(), "poses", (trajectory.start, trajectory.end))
     if len(kept) < len(images):
         CONSOLE.print(
-            f"{len(images) - len(kept)} of {len(images)} images are left out: they were taken outside the poses."
+            f"{len(images) - len(kept)} of {len(images)} images are left out: they were taken outside the poses, or in "
+            "a gap of them."
         )
     mount = torch.eye(4, dtype=torch.float64) if event_from_frame is None else event_from_frame
     views = [ReferenceView(file, homogeneous(trajectory.interpolate(time)) @ mount, time) for time, file in kept]

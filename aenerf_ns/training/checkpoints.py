@@ -35,14 +35,14 @@ def checkpoint_to_load(path: Path, step: int | None = None) -> Path:
     folder = path.parent if path.name == "config.yml" and path.is_file() else path
     if not folder.is_dir():
         raise DataError(folder, "there is no such folder", "give the folder of a trained run")
-    if not _newest_first(folder) and (folder / "nerfstudio_models").is_dir():
+    if not newest_first(folder) and (folder / "nerfstudio_models").is_dir():
         folder /= "nerfstudio_models"
     if step is not None:
         path = folder / f"step-{step:09d}.ckpt"
         _require_whole(path)
         return path
     broken: list[str] = []
-    for path in _newest_first(folder):
+    for path in newest_first(folder):
         fault = _fault(path)
         if fault is None:
             if broken:
@@ -62,7 +62,7 @@ def warn_of_later_checkpoints(folder: Path, start: int) -> None:
 
     Commands that open a run take its newest checkpoint.
     """
-    newest = next(iter(_newest_first(folder)), None)
+    newest = next(iter(newest_first(folder)), None)
     if newest is not None and step_of(newest) >= start:
         problem = f"{newest.name} is of another training. While it is the newest, the run opens with it"
         line = f"{folder}: {problem}: move it away, or give another --timestamp"
@@ -74,7 +74,7 @@ def _require_whole(path: Path) -> None:
     fault = _fault(path)
     if fault is None:
         return
-    whole = next((other for other in _newest_first(path.parent) if _fault(other) is None), None)
+    whole = next((other for other in newest_first(path.parent) if _fault(other) is None), None)
     remedy = _OTHER_RUN
     if whole is not None:
         # Both options, whichever named the broken one.
@@ -87,7 +87,8 @@ def step_of(path: Path) -> int:
     return int(path.stem.removeprefix("step-"))
 
 
-def _newest_first(folder: Path) -> list[Path]:
+def newest_first(folder: Path) -> list[Path]:
+    """Return the checkpoints in a folder, the latest step first."""
     names = [path for path in folder.glob("step-*.ckpt") if path.stem.removeprefix("step-").isdecimal()]
     return sorted(names, key=step_of, reverse=True)
 

@@ -27,7 +27,7 @@ from aenerf_ns.atomic_write import atomic_write
 from aenerf_ns.errors import DataError, errors_as_one_line
 from aenerf_ns.files.output_paths import require_writable
 from aenerf_ns.training import framework
-from aenerf_ns.training.checkpoints import checkpoint_to_load, step_of, warn_of_later_checkpoints
+from aenerf_ns.training.checkpoints import checkpoint_to_load, newest_first, step_of, warn_of_later_checkpoints
 from aenerf_ns.training.preflight import require_device
 from aenerf_ns.training.run_record import RunRecord, ScalarWriter
 from aenerf_ns.training.schedules import RelativeCosineSchedulerConfig, RelativeMultiStepSchedulerConfig
@@ -266,7 +266,7 @@ class AENeRFTrainer(Trainer):
 
     @check_main_thread
     def save_checkpoint(self, step: int) -> None:
-        """Save a checkpoint after a step, whole or not at all. The older ones are removed after that."""
+        """Save a checkpoint after a step, whole or not at all. Those of earlier steps are removed after that."""
         contents = {
             "step": step,
             "pipeline": self.pipeline.state_dict(),
@@ -280,8 +280,9 @@ class AENeRFTrainer(Trainer):
             with atomic_write(path, partial):
                 torch.save(contents, partial)
             if self.config.save_only_latest_checkpoint:
-                for other in self.checkpoint_dir.glob("*.ckpt"):
-                    if other != path:
+                # Those of later steps are of another training.
+                for other in newest_first(self.checkpoint_dir):
+                    if step_of(other) < step:
                         other.unlink()
 
 

@@ -1,5 +1,7 @@
 """Pixel directions against OpenCV's projection and against the framework's own rays."""
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
@@ -13,8 +15,10 @@ DAVIS = CameraIntrinsics(
 )
 FISHEYE = CameraIntrinsics(320, 240, 160.0, 161.0, 157.0, 122.0, "fisheye", (-0.022, -0.008, 0.003, -0.0006))
 PINHOLE = CameraIntrinsics(5, 4, 6.0, 7.0, 2.5, 2.0)
+# Its optical axis goes through a pixel's center, where the framework alone would have no direction.
+CENTERED = replace(FISHEYE, cx=160.5, cy=120.5)
 OF_EACH_LENS = pytest.mark.parametrize(
-    "camera", [DAVIS, FISHEYE, PINHOLE], ids=["radial_tangential", "fisheye", "pinhole"]
+    "camera", [DAVIS, FISHEYE, CENTERED, PINHOLE], ids=["radial_tangential", "fisheye", "centered", "pinhole"]
 )
 
 

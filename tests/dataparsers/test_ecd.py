@@ -49,6 +49,15 @@ def test_ecd_text_reads(ecd: Path) -> None:
     assert len(parse(config, "test").image_filenames) == 1
 
 
+def test_an_image_in_a_gap_of_the_true_poses_is_left_out(ecd: Path, tmp_path: Path) -> None:
+    (ecd / "groundtruth.txt").rename(tmp_path / "other.txt")
+    times = [0.01 * i for i in range(41) if not 10 < i < 30]
+    (ecd / "groundtruth.txt").write_text("".join(f"{time} {time} 0 0 0 0 0 1\n" for time in times))
+    for trajectory in (None, tmp_path / "other.txt"):
+        views = EcdDataParserConfig(data=ecd, trajectory=trajectory).setup().recording.reference_views["train"]
+        assert [view.file.name for view in views] == ["0.png", "3.png"]
+
+
 def test_names_of_images_hold_a_blank(ecd: Path) -> None:
     config = EcdDataParserConfig(data=ecd)
     names = [name for _, name in (line.split() for line in (ecd / "images.txt").read_text().splitlines())]

@@ -50,6 +50,11 @@ def test_frame_without_pose_gets_that_of_its_time(native: Path) -> None:
     pose = parse(NativeDataParserConfig(data=native, **AS_RECORDED), "test").cameras.camera_to_worlds[0]
     expected = homogeneous(make_trajectory().interpolate(time)) @ torch.linalg.inv(torch.from_numpy(shift))
     torch.testing.assert_close(pose, (expected @ OPENCV_TO_OPENGL)[:3].float(), rtol=0, atol=1e-6)
+    # In a gap of the true poses it has none.
+    truth = native / "trajectory_ground_truth.txt"
+    lines = truth.read_text().splitlines()
+    truth.write_text("\n".join(lines[:2] + lines[9:]))
+    assert len(parse(NativeDataParserConfig(data=native), "test").cameras) == 1
 
 
 def test_frames_of_one_time_are_refused_where_poses_are_missing(native: Path) -> None:

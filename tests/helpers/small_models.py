@@ -56,6 +56,7 @@ def make_scene(
         event_file=EventsInMemory(make_stream([], camera.width, camera.height)),
         sensor=sensor,
         window=TimeWindow(),
+        camera=camera,
         camera_times=torch.tensor([0]),
         has_image=[False],
         image_encoding="srgb",

@@ -3,12 +3,15 @@
 from pathlib import Path
 from typing import Literal
 
+import numpy as np
 import pytest
 import torch
-from helpers.small_pipelines import make_pipeline
+from helpers.small_pipelines import make_pipeline, make_pipeline_config
 from nerfstudio.cameras.rays import RayBundle
+from PIL import Image
 
 from aenerf_ns.camera.image_encoding import encode
+from aenerf_ns.camera.intrinsics import CameraIntrinsics
 from aenerf_ns.evaluation.color_fit import replace_color_correction
 from aenerf_ns.method.color_correction import (
     COLOR_CORRECTIONS,
@@ -189,6 +192,21 @@ def test_each_protocol_is_fitted_on_its_own_views(test_mode: Literal["test", "va
     outputs = pipeline.model.eval()(rays)
     torch.testing.assert_close(outputs["rgb"], encode(torch.exp(outputs["log_radiance"]), "srgb"))
     assert pipeline.model.color_correction.description == "none"
+
+
+def test_pixels_without_a_direction_are_not_fitted(tmp_path: Path) -> None:
+    make_pipeline_config(tmp_path / "made")
+    file = tmp_path / "made" / "transforms.json"
+    file.write_text(file.read_text().replace('"k1": 0.0', '"k1": -1.0'))
+    usable = CameraIntrinsics(6, 4, 5.0, 5.0, 3.0, 2.0, distortion=(-1.0, 0.0, 0.0, 0.0, 0.0)).pixel_directions()[1]
+    assert 0 < usable.sum() < 24
+    for image in (tmp_path / "made" / "images" / "val").iterdir():
+        Image.fromarray(np.where(usable[..., None], np.uint8(102), np.uint8(255)).repeat(3, -1)).save(image)
+    pipeline = make_pipeline(tmp_path / "made", "val")
+    pipeline.color_fit.fit()
+    rays = pipeline.datamanager.reference_views("val").cameras[0:1].generate_rays(0, keep_shape=False)
+    shown = pipeline.model.eval()(rays)["rgb"].unflatten(0, (4, 6))[torch.from_numpy(usable)]
+    torch.testing.assert_close(shown, torch.full_like(shown, 0.4), atol=0.02, rtol=0)
 
 
 def test_without_reference_views_every_fitted_protocol_says_that_it_is_a_stretch(tmp_path: Path) -> None:

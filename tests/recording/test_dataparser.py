@@ -110,6 +110,10 @@ def test_refuse_scale_of_turning_camera(ecd: Path) -> None:
     parse(EcdDataParserConfig(data=ecd))
     with pytest.raises(DataError, match="--auto-scale-poses False"):
         parse(EcdDataParserConfig(data=ecd, auto_scale_poses=True))
+    # A camera that moves along its axis has no focus.
+    (ecd / "groundtruth.txt").write_text("".join(f"{0.1 * i} 0 0 {i} 0 0 0 1\n" for i in range(5)))
+    with pytest.raises(DataError, match=r"groundtruth.txt: all cameras look in one direction and have no focus; give"):
+        parse(EcdDataParserConfig(data=ecd, center_method="focus"))
 
 
 def test_images_are_thinned_within_the_window(tmp_path: Path) -> None:

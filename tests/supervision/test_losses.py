@@ -44,6 +44,9 @@ def test_psnr_by_hand_and_lpips_is_absent_unless_asked_for() -> None:
     assert values["psnr"] == pytest.approx(-20 * math.log10(0.1), abs=1e-3)
     assert 0 < values["ssim"] < 1
     assert metrics(reference, reference)["psnr"] == 100
+    # What is not compared changes nothing.
+    mask = torch.arange(16).expand(16, 16)[..., None] < 13
+    assert metrics(torch.where(mask, reference + 0.1, -5.0), reference, mask)["psnr"] == pytest.approx(values["psnr"])
     # A rendering that is not finite is no good one.
     assert math.isnan(metrics(reference * torch.nan, reference)["psnr"])
     assert "lpips" not in values

@@ -216,6 +216,10 @@ def test_a_training_beside_later_checkpoints_of_another_one_says_so(
     train_small_model(tmp_path, "run", 1, load_step=2, **resumed)
     said = f"{first.checkpoint_dir}: step-000000004.ckpt is of another training. While it is the newest, the run opens"
     assert said in capsys.readouterr().out
+    # The newer model stays, whatever a training from the beginning saves.
+    train_small_model(tmp_path, "run", 2)
+    names = sorted(path.name for path in first.checkpoint_dir.iterdir())
+    assert names == ["step-000000001.ckpt", "step-000000002.ckpt", "step-000000003.ckpt", "step-000000004.ckpt"]
 
 
 @contextmanager
