@@ -21,6 +21,8 @@ _MILLISECOND = 1_000_000
 _MIN_POLARITY_SHARE, _MAX_REPEATED_SHARE, _MAX_HOT_PIXEL_SHARE = 0.02, 0.05, 0.01
 # Of the polarities with the change from frame to frame.
 _MIN_CORRELATION = -0.4
+# Frames that fit the events less have another clock, or are too few, and tell no size of the thresholds.
+_MIN_FIT = 0.6
 # A ratio of the thresholds that differs from the estimate by so many times its uncertainty is clearly another.
 _THRESHOLD_DEVIATIONS = 2.0
 # Share of the events at each side that does not count for the extent of the events.
@@ -104,7 +106,7 @@ def check_thresholds(
     used = sensor.positive_contrast_threshold / sensor.negative_contrast_threshold
     figure = f"Contrast thresholds: C+/C- is {ratio:.2f} +/- {uncertainty:.2f} by the balance of the polarities"
     figure += f" ({'assumed' if capture.has_assumed_thresholds else 'given'}: {used:.2f})"
-    if correlation > 0:
+    if correlation > _MIN_FIT:
         size, low, high = changes.negative_threshold(ratio)
         figure += f"; by the frames, C- is {size:.2f} ({low:.2f} to {high:.2f}) and C+ {ratio * size:.2f}"
     # Reversed polarities reverse the ratio.
@@ -116,7 +118,7 @@ def check_thresholds(
         else:
             figure += f". If the given ones were a guess, give the format --positive-contrast-threshold {value}"
     result.figures.append(figure)
-    bandwidth = changes.bandwidth(ratio) if correlation > 0 else None
+    bandwidth = changes.bandwidth(ratio) if correlation > _MIN_FIT else None
     if bandwidth is not None:
         frequency, low, high = bandwidth
         given = f"given: {sensor.bandwidth:.0f}" if sensor.bandwidth > 0 else "to state it: --bandwidth-hz"

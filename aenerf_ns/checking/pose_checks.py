@@ -22,6 +22,8 @@ _GAP_FACTOR, _MAX_GAP_SHARE, _MIN_GAP_RATE = 5, 0.01, 0.01
 _EQUAL_POSES, _MAX_STILL_SHARE = 1e-12, 0.05
 # A jump is faster than the steps around it, and than the median, by this factor.
 _JUMP_FACTOR = 5
+# Radians. Less is what rounds off where a quaternion is written with few digits.
+_MIN_TURN = 1e-4
 
 
 def check_poses(result: CheckResult, recording: Recording, window: TimeWindow, num_posed: int) -> None:
@@ -99,11 +101,13 @@ def check_steps(result: CheckResult, trajectory: Trajectory, window: TimeWindow)
         )
     seconds = np.diff(times) * 1e-9
     jumps = np.zeros(len(seconds), bool)
-    for steps in (rotation_angle(poses[:-1], poses[1:]), poses[..., 3].diff(dim=0).norm(dim=-1)):
-        rates = steps.numpy() / seconds
+    turns, moves = rotation_angle(poses[:-1], poses[1:]).numpy(), poses[..., 3].diff(dim=0).norm(dim=-1).numpy()
+    # Poses at rest step by the last digit that was written.
+    for steps, least in ((turns, _MIN_TURN), (moves, _JUMP_FACTOR * moves[moves > 0].min(initial=np.inf))):
+        rates = steps / seconds
         padded = np.pad(rates, 3, mode="edge")
         around = np.max([padded[3 + k : 3 + k + len(rates)] for k in (-3, -2, 2, 3)], 0)
-        jumps |= (rates > _JUMP_FACTOR * around) & (rates > _JUMP_FACTOR * np.median(rates))
+        jumps |= (rates > _JUMP_FACTOR * np.maximum(around, np.median(rates))) & (steps > least)
     jumps &= window.contains(times[:-1]) & window.contains(times[1:])
     if jumps.any():
         result.problems.append(

@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 from aenerf_ns.events.stream import EventStream
 from aenerf_ns.files.event_reader import EventFile
 
-# Parts of the recording at whose ends the balance is compared.
-_NUM_PARTS = 60
+# Parts of the recording at whose ends the balance is compared, and blocks along each side of the sensor.
+_NUM_PARTS, _NUM_BLOCKS = 60, 8
 _MIN_EVENTS = 2_000
 # Share of the ratio by which thresholds that differ between pixels, and noise, may bias it.
 _BIAS = 0.03
@@ -29,30 +29,36 @@ class PolarityBalance:
         self._last_time = np.zeros((file.height, file.width), np.int64)
         self._last_polarity = np.zeros((file.height, file.width), np.int8)
         self._ends = np.linspace(*file.time_span(), _NUM_PARTS + 1).astype(np.int64)[1:-1]
-        self._sums = np.zeros((2, _NUM_PARTS))
+        self._size = file.width, file.height
+        # Thresholds by polarity, part and block.
+        self._sums = np.zeros((2, _NUM_PARTS, _NUM_BLOCKS**2))
 
     def add(self, events: EventStream) -> NDArray[np.float64]:
         """Add a piece of the stream of events, and return for how many thresholds each event stands."""
         weights = _weigh(
             events.x, events.y, events.t, events.p, self._last_time, self._last_polarity, self._refractory_period
         )
-        parts = np.searchsorted(self._ends, events.t)
+        place = np.searchsorted(self._ends, events.t)
+        for coordinates, side in zip((events.y, events.x), self._size[::-1], strict=True):
+            place = place * _NUM_BLOCKS + coordinates * _NUM_BLOCKS // side
         for sums, polarity in zip(self._sums, (1, -1), strict=True):
-            sums += np.bincount(parts, weights * (events.p == polarity), _NUM_PARTS)
+            sums += np.bincount(place, weights * (events.p == polarity), sums.size).reshape(sums.shape)
         return weights
 
     def ratio(self) -> tuple[float, float] | None:
         """Return C+ / C− and its uncertainty, or None if there are hardly any events.
 
-        The brightness of what is seen at the end differs from that at the beginning about as it does in between: the
-        uncertainty is twice the standard deviation of the balance over time, and 3 % of the ratio for sensors' faults.
+        The brightness of what is seen at the end differs from that at the beginning about as it does in between, and in
+        blocks of the sensor it differs independently: the uncertainty has twice the standard deviation of the balance
+        over time, the balances of the blocks, and 3 % of the ratio for sensors' faults.
         """
-        positive, negative = self._sums.cumsum(1)
+        positive, negative = self._sums.sum(2).cumsum(1)
         if min(positive[-1], negative[-1]) < _MIN_EVENTS:
             return None
         ratio = negative[-1] / positive[-1]
         drift = 2 * (negative - ratio * positive).std() / positive[-1]
-        return float(ratio), float(np.hypot(drift, _BIAS * ratio))
+        of_blocks = np.linalg.norm(self._sums.sum(1).T @ [-ratio, 1]) / positive[-1]
+        return float(ratio), float(np.linalg.norm([drift, of_blocks, _BIAS * ratio]))
 
 
 @numba.njit(cache=True)

@@ -138,12 +138,11 @@ def views_to_copy(recording: Recording, window: TimeWindow) -> dict[Split, list[
         first, last = recording.event_file.time_span()
         gaps = recording.trajectory.known_time(recording.max_pose_gap).gaps
         window = TimeWindow(max(first, window.start), min(last, window.end), gaps)
-    return {
-        split: thin_views(
-            [view for view in views if view.time is None or window.contains(view.time)], recording.max_views
-        )
-        for split, views in recording.reference_views.items()
-    }
+    chosen: dict[Split, list[ReferenceView]] = {}
+    for split, views in recording.reference_views.items():
+        within = [view for view in views if view.time is None or window.contains(view.time)]
+        chosen[split] = within if split == "train" else thin_views(within, recording.max_views)
+    return chosen
 
 
 def copy_images(writer: NativeDatasetWriter, recording: Recording, views: Mapping[Split, list[ReferenceView]]) -> None:

@@ -173,7 +173,9 @@ class ExportMesh(RunCommand):
         _, run, _ = open_run(self.load_config, self.data, test_mode="inference")
         from aenerf_ns.export.mesh import extract_mesh
 
-        mesh = extract_mesh(run, self.num_views, self.resolution)
+        # Vertex colors of glTF are linear, those of the others sRGB.
+        is_linear = self.output.suffix.lower() == ".glb"
+        mesh = extract_mesh(run, self.num_views, self.resolution, "linear" if is_linear else "srgb")
         with creating(self.output) as file:
             mesh.export(file)
         sides = " x ".join(f"{side:.3g}" for side in mesh.extents)

@@ -93,7 +93,7 @@ class Reconstruct(DatasetCommand):
         """Write the events and an image of each batch of them that ends at a time with a pose. Yield the images."""
         # The views of a dataset are in the world of its true poses where it has these, whatever poses are trained on.
         events, reference = recording.event_file, recording.reference_trajectory
-        known = recording.trajectory.known_time(recording.max_pose_gap)
+        known, truly = recording.trajectory.known_time(recording.max_pose_gap), reference.time_without_gaps()
         num_events = max(int(self.events_per_pixel * events.width * events.height), 1)
 
         def copied() -> Iterator[EventStream]:
@@ -105,7 +105,7 @@ class Reconstruct(DatasetCommand):
         for time, image in source(batches_of(copied(), num_events)):
             num_images += 1
             time -= recording.sensor.image_lag
-            if known.contains(time) and reference.start <= time <= reference.end:
+            if known.contains(time) and truly.contains(time):
                 num_posed += 1
                 writer.add_image("train", image, reference.interpolate(time), time)
                 yield image

@@ -167,7 +167,7 @@ class SimulateVideo(SimulationCommand):
 
         reference = poses.estimated if poses.truth is None else poses.truth
         # The first frame lies before all events.
-        taken = [time for time in video.times[1:].tolist() if reference.start <= time <= reference.end]
+        taken = video.times[1:][reference.time_without_gaps().contains(video.times[1:])].tolist()
         chosen: dict[Split, list[int]] = {
             "train": spread_evenly(taken, self.train_images),
             "val": spread_evenly(taken[::2], self.validation_views),

@@ -7,6 +7,7 @@ import torch
 import trimesh
 from numpy.typing import NDArray
 
+from aenerf_ns.camera.image_encoding import ImageEncoding, decode, encode
 from aenerf_ns.camera.intrinsics import CameraIntrinsics
 from aenerf_ns.errors import DataError
 from aenerf_ns.evaluation.run import TrainedRun
@@ -25,7 +26,7 @@ _BLOCK, _NUM_BLOCKS = 8, 40_000
 _MIN_VIEWS = 1.0
 
 
-def extract_mesh(run: TrainedRun, num_views: int, resolution: int) -> trimesh.Trimesh:
+def extract_mesh(run: TrainedRun, num_views: int, resolution: int, encoding: ImageEncoding = "srgb") -> trimesh.Trimesh:
     """Fuse the depths of views along the corrected trajectory in a truncated signed distance field, and mesh it.
 
     The field of the framework's own exporter forgets: a voxel holds the mean of its last two views or so, and the mesh
@@ -36,6 +37,7 @@ def extract_mesh(run: TrainedRun, num_views: int, resolution: int) -> trimesh.Tr
         num_views: evenly spread over the time of the run, two or more.
         resolution: voxels along the longest side of the box that is meshed: the dataset's scene box where it states
             one, else a box that holds nearly all that the views see.
+        encoding: of the mesh's colors.
 
     Returns:
         A mesh with vertex colors, in the recording's world and units.
@@ -89,10 +91,12 @@ def extract_mesh(run: TrainedRun, num_views: int, resolution: int) -> trimesh.Tr
     if len(mesh.triangle.indices) == 0:
         problem = f"no two of {num_views} views see the same surface in voxels of {voxel:.3g} units"
         raise DataError(run.data, problem, "give a higher --num-views or --resolution, or train it longer")
+    displayed = torch.from_numpy(mesh.vertex.colors.numpy()).clamp(0, 1)
+    shown = encode(decode(displayed, run.recording.image_encoding), encoding)
     return trimesh.Trimesh(
         mesh.vertex.positions.numpy().astype(np.float64),
         mesh.triangle.indices.numpy().astype(np.int64),
-        vertex_colors=np.rint(255 * mesh.vertex.colors.numpy().clip(0, 1)).astype(np.uint8),
+        vertex_colors=np.rint(255 * shown.numpy()).astype(np.uint8),
         process=False,
     )
 

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from aenerf_ns.errors import DataError
 from aenerf_ns.events.stream import EventStream
-from aenerf_ns.files.event_reader import EventFile, batches, resolve_sensor_size
+from aenerf_ns.files.event_reader import TOPIC_OPTION, EventFile, batches, resolve_sensor_size
 from aenerf_ns.files.limits import MAX_HEADER, MAX_PIECE, require_unpacked_size
 
 _MAGIC = b"#!AER-DAT4.0\r\n"
@@ -78,7 +78,7 @@ class Aedat4File(EventFile):
             stream = next(iter(streams))
         if stream not in streams:
             problem = "several streams hold events" if stream is None else f"stream {stream} holds no events"
-            raise DataError(path, problem, f"choose one of {', '.join(streams)}")
+            raise DataError(path, problem, f"choose one of {', '.join(streams)} ({TOPIC_OPTION})")
         self._number = int(stream)
         super().__init__(path, *resolve_sensor_size(path, streams[stream], width, height))
 

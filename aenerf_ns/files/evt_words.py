@@ -163,15 +163,17 @@ def without_damaged_times(blocks: Iterable[NDArray], encoding: Encoding, left_ou
     """Blank out upper bits of a time that jump and come back within a few words, and the events that they would date.
 
     Such words would move all later events by up to a lap of the time. The very last upper bits are blanked out as well
-    if they jump, because none confirm them, and the first ones if the next two contradict them.
+    if they jump, because none confirm them, and the first ones if the next two contradict them. Jumps that stay are
+    noted: cameras send the time without a pause.
 
     Args:
         blocks: (N,) words in pieces, which may end anywhere.
         encoding: of the words.
-        left_out: takes the events that are blanked out.
+        left_out: takes the events that are blanked out, and the note.
     """
     held, last = np.zeros(0, encoding.dtype), None
-    num_before = 0
+    num_before = num_jumps = 0
+    first_jump = ""
     for block in chain(blocks, (None,)):
         words = held if block is None else np.concatenate([held, block])
         where = np.flatnonzero(encoding.kinds(words) == TIME_HIGH)
@@ -187,15 +189,32 @@ def without_damaged_times(blocks: Iterable[NDArray], encoding: Encoding, left_ou
                 number = _blank_out(part, encoding)
                 if number:
                     left_out.add_number("after a damaged time", number, f"at word {num_before + where[index]}")
-            last = next((int(high[i]) for i in range(num_judged - 1, -1, -1) if i not in damaged), last)
+            kept = np.delete(np.arange(num_judged), damaged)
+            steps = np.diff(high[kept], prepend=last) & (1 << encoding.high_bits) - 1
+            jumps = np.flatnonzero(_jumps(steps, encoding))
+            if len(jumps) and not num_jumps:
+                seconds = steps[jumps[0]] * 0.065536 / encoding.max_steps
+                first_jump = f"by {seconds:.3g} s at word {num_before + where[kept[jumps[0]]]}"
+            num_jumps += len(jumps)
+            last = int(high[kept[-1]]) if len(kept) else last
         yield words[:end]
         held = words[end:]
         num_before += end
+    if num_jumps:
+        left_out.note(
+            f"jumps of the camera's time: {num_jumps}, the first {first_jump}. Events were lost there, or its clock "
+            "was restarted: cut the recording there."
+        )
 
 
 def _goes_on(before: NDArray | int, after: NDArray, encoding: Encoding) -> NDArray[np.bool_]:
     """Return whether upper bits of a time come at most 65 ms after others."""
     return (after - before) & (1 << encoding.high_bits) - 1 <= encoding.max_steps
+
+
+def _jumps(steps: NDArray[np.int64], encoding: Encoding) -> NDArray[np.bool_]:
+    """Return which steps are jumps. A few steps back leave events out of order, and move none by a lap."""
+    return np.minimum(steps, (1 << encoding.high_bits) - steps) > encoding.max_steps
 
 
 def _first_time_high(high: NDArray[np.int64], encoding: Encoding) -> int:
@@ -211,8 +230,7 @@ def _damaged_times(high: NDArray[np.int64], last: int, encoding: Encoding, is_en
     steps, steps_after = (high - before) & mask, (high[1:] - before[:-1]) & mask
     # One alone may differ from its neighbors by little.
     suspicious = np.append((steps_after <= encoding.max_steps) & (steps[:-1] > steps_after), False)
-    # A few steps back leave the events out of order, and move none by a lap.
-    jumps = np.minimum(steps, mask + 1 - steps) > encoding.max_steps
+    jumps = _jumps(steps, encoding)
     damaged: list[int] = []
     for index in np.flatnonzero(suspicious | jumps).tolist():
         # The first upper bits after damaged ones jump back, and are right.

@@ -1,4 +1,4 @@
-"""Events that a reader leaves out because they are malformed: which these are, and how many."""
+"""Events that a reader leaves out because they are malformed, and what else is missing: which, and how many."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class LeftOut:
     """
 
     def __init__(self) -> None:
-        self._printed = ""
+        self._printed: set[str] = set()
         self.restart()
 
     def restart(self) -> None:
@@ -35,6 +35,7 @@ class LeftOut:
         self.waiting: list[NDArray] = []
         self._counts: Counter[str] = Counter()
         self._first: dict[str, str] = {}
+        self._notes: list[str] = []
 
     def add(self, reason: str, bad: NDArray[np.bool_], describe: Callable[[int], str]) -> None:
         """Count the events of a piece that are left out for a reason; ``describe`` says where one is."""
@@ -45,6 +46,10 @@ class LeftOut:
         """Count events that are left out for a reason, the first of them at a place."""
         self._counts[reason] += number
         self._first.setdefault(reason, where)
+
+    def note(self, line: str) -> None:
+        """Keep a line to print on what a file lacks."""
+        self._notes.append(line)
 
     def in_order(self, columns: Sequence[NDArray]) -> list[NDArray]:
         """Leave out and count the fewest events whose absence leaves the others in order.
@@ -74,10 +79,12 @@ class LeftOut:
         return ", ".join(f"{n:,} {reason} (the first {self._first[reason]})" for reason, n in self._counts.items())
 
     def print_once(self, path: Path) -> None:
-        """Print what is left out of a file, unless that is what was printed last."""
-        if self.summary() != self._printed:
-            self._printed = self.summary()
-            print(f"{path.name}: events that are left out: {self._printed}.")
+        """Print what is left out of a file and what it lacks, each line once."""
+        summary = self.summary()
+        for line in [*([f"events that are left out: {summary}."] if summary else []), *self._notes]:
+            if line not in self._printed:
+                self._printed.add(line)
+                print(f"{path.name}: {line}")
 
     def require_few(self, source: Path, num_kept: int) -> None:
         """Raise a DataError if so many events are left out that the file must have been read wrongly."""

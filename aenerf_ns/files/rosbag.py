@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from aenerf_ns.errors import DataError
 from aenerf_ns.events.stream import EventStream
-from aenerf_ns.files.event_reader import Columns, EventFile, batches, resolve_sensor_size
+from aenerf_ns.files.event_reader import TOPIC_OPTION, Columns, EventFile, batches, resolve_sensor_size
 from aenerf_ns.files.limits import MAX_HEADER, bounded, require_unpacked_size, size_on_disk
 from aenerf_ns.files.plain_yaml import read_plain_yaml
 
@@ -112,19 +112,27 @@ class RosbagEventFile(EventFile):
     @contextmanager
     def _open(self) -> Iterator[rosbag1.Reader | rosbag2.Reader]:
         from rosbags.rosbag1 import Reader as Ros1Reader
+        from rosbags.rosbag1 import ReaderError as Ros1ReaderError
         from rosbags.rosbag2 import Reader as Ros2Reader
+        from rosbags.rosbag2 import ReaderError as Ros2ReaderError
 
-        if self.path.is_dir():
-            _require_distinct_files(self.path / "metadata.yaml")
-        elif _begins(self.path, _MCAP_MAGIC):
+        if self._is_ros2:
+            _require_whole_bag(self.path)
+        if self.path.is_file() and _begins(self.path, _MCAP_MAGIC):
             _require_records(self.path)
         elif not self._is_ros2:
             with self.path.open("rb") as file:
                 if b"index_pos=" + bytes(8) in file.read(_ROS1_HEADER_BYTES):
                     problem = "it has no index, as if interrupted"
                     raise DataError(self.path, problem, f"rosbag reindex {shlex.quote(str(self.path))}")
-        with Ros2Reader(self.path) if self._is_ros2 else Ros1Reader(self.path) as reader:
-            yield reader
+        try:
+            with Ros2Reader(self.path) if self._is_ros2 else Ros1Reader(self.path) as reader:
+                yield reader
+        except (Ros1ReaderError, Ros2ReaderError) as error:
+            # A recording that was interrupted lacks its end.
+            repair = "mcap recover" if self._is_ros2 else "rosbag reindex"
+            problem = f"not a readable {self.kind} ({error})"
+            raise DataError(self.path, problem, f"copy it again, or repair one that was cut off ({repair})") from error
 
     def _messages(self, start: int | None = None) -> Iterator[_Message]:
         """Yield the messages of the topic in the order in which they were received, from a time in nanoseconds on."""
@@ -163,9 +171,14 @@ class RosbagEventFile(EventFile):
 
         # The decoder's state is of no use at the first packet and after lost packets, where the sequence jumps.
         numbered = enumerate(self._messages(start))
-        for _, run in groupby(numbered, lambda pair: (pair[1].sequence or 0) - pair[0]):
+        lost: list[tuple[int, int]] = []
+        before = None
+        for ahead, run in groupby(numbered, lambda pair: (pair[1].sequence or 0) - pair[0]):
             messages = (message for _, message in run)
             first = next(messages)
+            if before is not None and ahead > before:
+                lost.append((ahead - before, first.stamp))
+            before = ahead
             words_of_packets = map(self._words, chain([first], messages))
             blocks = without_damaged_times(words_of_packets, EVT3, self.left_out)
             for words in blocks:
@@ -174,6 +187,11 @@ class RosbagEventFile(EventFile):
                     laps = round((first.stamp - self._clock_offset - time) / _LAP)
                     state = initial_state(self._clock_offset + laps * _LAP)
                     yield from decode_words(chain([words], blocks), EVT3, state, self.path)
+        if lost:
+            self.left_out.note(
+                f"packets that were lost when it was recorded: {sum(number for number, _ in lost)}, the first before "
+                f"{lost[0][1]} ns. Their events are missing."
+            )
 
     def _words(self, message: _Message) -> NDArray[np.uint16]:
         if message.encoding != "evt3":
@@ -222,11 +240,19 @@ def _begins(path: Path, magic: bytes) -> bool:
         return file.read(len(magic)) == magic
 
 
-def _require_distinct_files(metadata: Path) -> None:
-    """Raise a DataError for a bag of ROS 2 that lists a file twice: it would be read as often as it is listed."""
+def _require_whole_bag(path: Path) -> None:
+    """Raise a DataError for one file of a bag of ROS 2 that was split, and for a bag that lists a file twice."""
+    metadata = (path if path.is_dir() else path.parent) / "metadata.yaml"
+    if path.is_file() and not metadata.is_file():
+        return
     # It has some kilobytes for each topic that many nodes publish.
-    names = read_plain_yaml(metadata, MAX_HEADER)["rosbag2_bagfile_information"]["relative_file_paths"]
-    if len(set(names)) < len(names):
+    stated = read_plain_yaml(metadata, MAX_HEADER).get("rosbag2_bagfile_information", {})
+    names = stated.get("relative_file_paths", [])
+    if path.is_file() and len(names) > 1 and path.name in [Path(name).name for name in names]:
+        remedy = f"give its folder: --events {shlex.quote(str(path.parent))}, in aenerf --format-options events=..."
+        raise DataError(path, f"it is one of the {len(names)} files of a bag", remedy)
+    if path.is_dir() and len(set(names)) < len(names):
+        # Each would be read as often as it is listed.
         raise DataError(metadata, f"it lists {len(names)} files, {len(set(names))} of them distinct", "list each once")
 
 
@@ -258,7 +284,7 @@ def _choose(path: Path, types: dict[str, str], topic: str | None) -> str:
         problem = f"no topic holds events; the bag holds {found}"
         raise DataError(path, problem, "EventArray of dvs_msgs and EventPacket are read")
     problem = "several topics hold events" if topic is None else f"topic {topic} holds no events"
-    raise DataError(path, problem, f"choose one of {', '.join(known)} as topic")
+    raise DataError(path, problem, f"choose one of {', '.join(known)} as topic ({TOPIC_OPTION})")
 
 
 class _Fields:

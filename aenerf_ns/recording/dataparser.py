@@ -98,7 +98,9 @@ class EventDataParser(DataParser):
                 capture.event_file.drop_malformed = self.config.drop_malformed
                 self._check_lens(capture.event_camera, "event camera")
                 return capture, sorted(frames)
-        return self._recording, self._recording.frames
+            recording = self._recording
+            # Poses may be estimated at more times than those of the given ones.
+            return recording, recording.frames if self.poses_path() is None else sorted(self.read_capture()[1])
 
     @property
     def recording(self) -> Recording:

@@ -157,6 +157,8 @@ def _settings(config: TrainerConfig, run: TrainedRun) -> dict[str, Any]:
 def _measure_views(report: RunReport, run: TrainedRun, candidates: Sequence[str], shown: dict[str, str] | None) -> None:
     if run.views is not None or run.model.camera_optimizer.has_ground_truth:
         report.evaluation = evaluate(run)
+    else:
+        report.evaluation = {"pose_diagnosis": run.pose_diagnosis}
     if not report.views:
         report.missing.append("PSNR, SSIM and LPIPS: the recording has no test views.")
         return

@@ -60,8 +60,9 @@ def picture_views(run: TrainedRun, indices: Sequence[int]) -> tuple[list[ViewPic
     """Render reference views, by their indices, from where they are placed. The run is in evaluation mode.
 
     Returns:
-        The pictures of each view; and the contrast of each channel over all pixels of these views: the standard
-        deviation of the rendered log-radiance, before color correction, as a share of that of the images.
+        The pictures of each view; and the contrast of each channel over the pixels of these views that have a
+        direction: the standard deviation of the rendered log-radiance, before color correction, as a share of that of
+        the images.
     """
     model, dataset = run.model, run.views
     assert dataset is not None
@@ -71,9 +72,10 @@ def picture_views(run: TrainedRun, indices: Sequence[int]) -> tuple[list[ViewPic
         outputs = model.get_outputs_for_camera(dataset.cameras[index : index + 1].to(run.device))
         image = dataset.get_image_float32(index).to(run.device)
         pictures.append(_pictures(outputs, model.reference_display(image), scale))
-        rendered.append(outputs["log_radiance"].flatten(0, 1).double())
+        usable = dataset.usable.to(run.device)
+        rendered.append(outputs["log_radiance"][usable].double())
         # The color correction is fitted to the same values.
-        true.append(torch.log(model.reference_radiance(image).flatten(0, 1).double() + 1e-3))
+        true.append(torch.log(model.reference_radiance(image)[usable].double() + 1e-3))
     contrast = torch.cat(rendered).std(0) / torch.cat(true).std(0).clamp_min(1e-9)
     return pictures, contrast.tolist()
 

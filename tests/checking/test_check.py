@@ -21,11 +21,13 @@ from aenerf_ns.camera.time_window import TimeWindow
 from aenerf_ns.camera.trajectory import OPENCV_TO_OPENGL, Trajectory
 from aenerf_ns.checking.contrast import WarpedEvents
 from aenerf_ns.checking.contrast_checks import check_contrast, check_depth
+from aenerf_ns.checking.event_checks import check_thresholds
 from aenerf_ns.checking.hypotheses import clock_hypothesis
 from aenerf_ns.checking.pose_checks import check_poses
 from aenerf_ns.checking.report import check
 from aenerf_ns.cli.check import Check
 from aenerf_ns.dataparsers.native import NativeDataParserConfig
+from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.events.stream import EventStream
 from aenerf_ns.files.event_hdf5 import Hdf5EventWriter
 from aenerf_ns.files.tum_trajectory import read_tum_trajectory, write_tum_trajectory
@@ -361,6 +363,28 @@ def test_real_recording_prefers_its_poses_and_is_compared_with_frames(
     assert 0.35 < number_after("by the frames, C- is ", output) < 0.65
     option = number_after("ecd-data --positive-contrast-threshold ", output)
     assert option == pytest.approx(0.5 * ratio, abs=0.004)
+
+
+def test_frames_that_hardly_fit_tell_no_thresholds() -> None:
+    result: Any = SimpleNamespace(figures=[], sensor_options={})
+    capture: Any = SimpleNamespace(sensor=SensorModel(), has_assumed_thresholds=True)
+    changes: Any = SimpleNamespace(negative_threshold=lambda _: (0.08, 0.08, 0.08), bandwidth=lambda _: (9.0, 9.0, 9.0))
+    balance: Any = SimpleNamespace(ratio=lambda: (1.0, 0.1))
+    check_thresholds(result, capture, changes, balance, 0.32)
+    assert len(result.figures) == 1
+    assert "by the frames" not in result.figures[0]
+    check_thresholds(result, capture, changes, balance, 0.7)
+    assert "by the frames, C- is 0.08" in result.figures[1]
+
+
+def test_the_last_digit_of_poses_at_rest_is_no_jump(shorter: Path) -> None:
+    def drift(poses: torch.Tensor) -> torch.Tensor:
+        still = torch.eye(4, dtype=poses.dtype).repeat(len(poses), 1, 1)
+        still[:, 0, 3] = (torch.arange(len(poses)) * 4e-6).round(decimals=4)
+        return still
+
+    change_poses(shorter, drift)
+    assert "the poses jump" not in run(shorter)[1]
 
 
 @pytest.mark.parametrize(

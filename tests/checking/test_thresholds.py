@@ -34,6 +34,17 @@ def test_balance_gives_the_ratio(thresholds: tuple[float, float], name: str) -> 
     assert abs(ratio - truth) < uncertainty < 0.05 * truth
 
 
+def test_what_moves_once_through_the_picture_tells_no_ratio() -> None:
+    # One half of the pixels becomes brighter and does not fall again, and most of the other one becomes darker.
+    rows = [
+        (x, y, 1000 * k, 1 if x < WIDTH // 2 else -1) for k in range(8) for y in range(HEIGHT) for x in range(WIDTH)
+    ]
+    rows = [row for row in rows if row[3] > 0 or row[1] % 4]
+    ratio, uncertainty = ratio_of(make_stream(rows, WIDTH, HEIGHT), 0)
+    assert ratio == pytest.approx(0.73, abs=0.01)
+    assert uncertainty > (1 - ratio) / 2
+
+
 def test_refractory_period_weighs() -> None:
     # An event after an interval of 3 refractory periods stands for 3 / 2 thresholds, and after less than 2 for 2. The
     # first event of a change stands for one.

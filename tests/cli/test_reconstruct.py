@@ -107,6 +107,16 @@ def test_images_without_a_pose_are_left_out(data: Path, tmp_path: Path, capsys: 
     assert f"{25 - len(views)} of 25 images are left out" in capsys.readouterr().out
 
 
+def test_images_in_a_gap_of_the_true_poses_are_left_out(data: Path, tmp_path: Path) -> None:
+    lines = (data / "trajectory_ground_truth.txt").read_text().splitlines()
+    (data / "trajectory_ground_truth.txt").write_text("\n".join(lines[:5] + lines[14:]))
+    gap = [START + int(1e9 * (float(line.split()[0]) - float(lines[-21].split()[0]))) for line in (lines[4], lines[14])]
+    Reconstruct(data, tmp_path / "out").main()
+    views = opened(tmp_path / "out").reference_views["train"]
+    assert len(views) > 5
+    assert not any(view.time is not None and gap[0] + 1e6 < view.time < gap[1] - 1e6 for view in views)
+
+
 @pytest.mark.parametrize("change", [OTHER_LENS, MOUNTED_APART])
 def test_images_of_another_camera_are_left_out(
     change: Change, data: Path, tmp_path: Path, capsys: pytest.CaptureFixture

@@ -174,5 +174,8 @@ def test_mesh_is_in_recording_units(run: TrainedRun, monkeypatch: pytest.MonkeyP
     assert np.abs(distance - radius).mean() < 0.01
     assert np.quantile(np.abs(distance - radius), 0.95) < 0.03
     assert (made.visual.vertex_colors[distance < radius + 0.01] == [255, 128, 0, 255]).mean() > 0.9
+    linear = mesh.extract_mesh(run, num_views=5, resolution=48, encoding="linear")
+    is_near = np.linalg.norm(linear.vertices - center, axis=1) < radius + 0.01
+    assert (linear.visual.vertex_colors[is_near] == [255, 55, 0, 255]).mean() > 0.9
     with pytest.raises(DataError, match=r"no two of 1 views see the same surface in voxels .*; give a higher --num"):
         mesh.extract_mesh(run, num_views=1, resolution=48)

@@ -233,6 +233,18 @@ def test_words_have_the_times_of_good_ones(
     assert (f"{number} after a damaged time (the first at word" in said) == (number > 0)
 
 
+def test_a_jump_of_the_time_that_stays_is_named(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    def events(first: int) -> list[int]:
+        return [word for high in range(first, first + 9) for word in (0x8000 | high, 0x6001, 0x0005, 0x2001)]
+
+    path = folder / "restarted.raw"
+    path.write_bytes(HEADER3 + np.array([*events(0x700), *events(0x100)], "<u2").tobytes())
+    assert len(read(open_event_file(path))) == 18
+    # By 0xA00 - 8 steps of 4.096 ms.
+    said = "restarted.raw: jumps of the camera's time: 1, the first by 10.5 s at word 36. Events were lost there"
+    assert capsys.readouterr().out.count(said) == 1
+
+
 def test_convert_leaves_out_malformed_events(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     events = random_events()
     write_calibration(tmp_path / "calibration.json")

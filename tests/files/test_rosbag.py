@@ -74,7 +74,7 @@ def test_packets_have_the_times_of_ros(kind: str, folder: Path) -> None:
     assert open_event_file(path).time_span() == (expected[0, 2], expected[-1, 2])
 
 
-def test_lost_packets_reset_the_decoder(folder: Path) -> None:
+def test_lost_packets_reset_the_decoder(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     packets = [[0x8001, 0x6001, 0x0005, 0x2001], [0x0006], [0x2002, 0x8001, 0x6003, 0x2003, 0x0007, 0x2004]]
     messages = [
         (START + i, packet_message(i, START + i, np.array(words, "<u2").tobytes())) for i, words in enumerate(packets)
@@ -82,6 +82,8 @@ def test_lost_packets_reset_the_decoder(folder: Path) -> None:
     path = write_bag(folder / "lost.bag", {"/events": (PACKET, [messages[0], messages[2]])})
     # The events of the last packet before its row are at no known place.
     assert read(open_event_file(path))[:, :2].tolist() == [[1, 5], [4, 7]]
+    said = f"lost.bag: packets that were lost when it was recorded: 1, the first before {START + 2} ns"
+    assert capsys.readouterr().out.count(said) == 1
 
 
 @pytest.mark.parametrize(("packet", "word"), [(0, 0), (0, 4), (3, 0), (3, 4), (4, 4), (6, 0), (8, 0), (11, 4)])
@@ -171,6 +173,28 @@ def test_bag_of_ros2_without_metadata_opens(folder: Path) -> None:
     (path / "metadata.yaml").unlink()
     with pytest.raises(DataError, match=r"metadata.yaml: there is no such file"):
         file.time_span()
+
+
+def test_a_part_of_a_bag_of_ros2_is_refused(folder: Path) -> None:
+    path = write_bag2(folder / "split", [(START, array_message([(1, 2, START // 1000, 1)]))], ARRAY)
+    (stored,) = path.glob("*.db3")
+    metadata = path / "metadata.yaml"
+    metadata.write_text(metadata.read_text().replace(f"- {stored.name}", f"- {stored.name}\n  - other.db3", 1))
+    assert "other.db3" in metadata.read_text()
+    with pytest.raises(DataError, match=r"it is one of the 2 files of a bag; give its folder: --events .*/split, in"):
+        read(open_event_file(stored, WIDTH, HEIGHT))
+
+
+def test_an_interrupted_bag_can_be_repaired(folder: Path) -> None:
+    (stored,) = write_bag2(folder / "cut", [(START, array_message([(1, 2, START // 1000, 1)]))], ARRAY, "MCAP").glob(
+        "*.mcap"
+    )
+    alone = folder / "alone.mcap"
+    alone.write_bytes(stored.read_bytes()[:-20])
+    with pytest.raises(
+        DataError, match=r"alone.mcap: .*; copy it again, or repair one that was cut off .mcap recover."
+    ):
+        read(open_event_file(alone, WIDTH, HEIGHT))
 
 
 @pytest.mark.parametrize("cut", [1, 10, 30, 61])

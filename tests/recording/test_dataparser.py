@@ -14,6 +14,7 @@ from helpers.streams import unpacked
 
 from aenerf_ns.camera.time_window import TimeWindow
 from aenerf_ns.camera.trajectory import Trajectory
+from aenerf_ns.cli.dataset import views_to_copy
 from aenerf_ns.dataparsers.ecd import EcdDataParserConfig
 from aenerf_ns.dataparsers.native import NativeDataParserConfig
 from aenerf_ns.errors import DataError
@@ -131,6 +132,13 @@ def test_images_are_thinned_within_the_window(tmp_path: Path) -> None:
     assert [len(parse(windowed, split).image_filenames) for split in ("val", "test")] == [10, 10]
     # Poses are estimated from all of them, also where there are none yet.
     assert len(config.setup().read_frames()[1]) == 200
+    # A dataset that is converted has all frames that may be trained on.
+    views = views_to_copy(config.setup().recording, TimeWindow())
+    assert {split: len(kept) for split, kept in views.items()} == {"train": 200, "val": 30, "test": 30}
+    poses = truth.data / "trajectory.txt"
+    poses.write_text("".join(poses.read_text().splitlines(keepends=True)[:-5]))
+    assert len(config.setup().read_frames()[1]) == 200
+    assert len(config.setup().recording.reference_views["train"]) < 200
     (truth.data / "trajectory.txt").unlink()
     capture, images = config.setup().read_frames()
     assert len(images) == 200

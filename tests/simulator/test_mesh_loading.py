@@ -1,5 +1,7 @@
 """Meshes from files, and errors in them."""
 
+import json
+import struct
 from pathlib import Path
 
 import numpy as np
@@ -30,6 +32,18 @@ def load_obj(folder: Path, text: str, materials: str = "") -> Mesh:
     (folder / "a.mtl").write_text(materials, encoding="utf-8")
     (folder / "a.obj").write_text(text, encoding="utf-8")
     return load_mesh(folder / "a.obj", False)
+
+
+def test_refuse_colors_of_a_glb_that_would_be_cut(tmp_path: Path) -> None:
+    part = {"attributes": {"POSITION": 0, "COLOR_0": 1}}
+    accessors = [{"componentType": 5126}, {"componentType": 5123}]
+    header = json.dumps({"asset": {"version": "2.0"}, "meshes": [{"primitives": [part]}], "accessors": accessors})
+    content = header.encode()
+    (tmp_path / "a.glb").write_bytes(
+        struct.pack("<4sIII4s", b"glTF", 2, 20 + len(content), len(content), b"JSON") + content
+    )
+    with pytest.raises(DataError, match=r"a.glb: colors of 16 bits on a surface without a material; give it one"):
+        load_mesh(tmp_path / "a.glb", True)
 
 
 def test_glb_and_obj_look_alike(tmp_path: Path) -> None:

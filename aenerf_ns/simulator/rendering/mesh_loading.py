@@ -28,6 +28,8 @@ _MAX_BYTES = 1 << 30
 _UNCOLORED = 0.5
 """Albedo of a surface that has no color in its file."""
 _REMEDY = "export the mesh again"
+# The number of a type in glTF.
+_UINT16 = 5123
 
 
 def load_mesh(path: Path, y_up: bool, gloss: Mapping[str, Gloss] | None = None) -> Mesh:
@@ -285,10 +287,15 @@ def _require_plain_glb(path: Path, content: bytes) -> None:
             raise ValueError("no glTF 2.0 header")
         required = [name for name in header.get("extensionsRequired", []) if not name.startswith("KHR_materials")]
         has_unknown_textures = any("source" not in texture for texture in header.get("textures", []))
-    except (struct.error, ValueError, AttributeError, TypeError) as error:
+        parts = [part for mesh in header.get("meshes", []) for part in mesh["primitives"] if "material" not in part]
+        colors = [part["attributes"]["COLOR_0"] for part in parts if "COLOR_0" in part["attributes"]]
+        has_cut_colors = any(header["accessors"][index]["componentType"] == _UINT16 for index in colors)
+    except (struct.error, LookupError, ValueError, AttributeError, TypeError) as error:
         raise DataError(path, f"not a binary glTF file ({error})", "export the mesh as .glb") from error
     if required:
         raise DataError(path, f"needs {', '.join(required)}", "export the mesh without extensions or compression")
+    if has_cut_colors:
+        raise DataError(path, "colors of 16 bits on a surface without a material", "give it one, or colors of 8 bits")
     if has_unknown_textures:
         raise DataError(path, "textures of an unknown kind", "export the mesh with PNG or JPEG textures")
 
