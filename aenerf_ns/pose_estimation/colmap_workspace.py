@@ -104,6 +104,8 @@ class ColmapWorkspace:
         self._progress = progress
         self._min_motion = min_motion
         self.held_out: list[tuple[tuple[int, int], list[NDArray[np.float64]]]] = []
+        # Pixels in a unit of the plane at depth 1, where the held-out matches are.
+        self._scales: list[NDArray[np.float64]] = []
 
     def add_frames(self, frames: Iterable[Path | NDArray[np.uint8]], size: tuple[int, int], source: str | Path) -> None:
         """Write the frames as image files for COLMAP."""
@@ -204,18 +206,19 @@ class ColmapWorkspace:
         """Take the matches of a share of the pairs of frames out of the database, to judge models by."""
         with pycolmap.Database.open(self._database) as database:
             camera = database.read_all_cameras()[0]
-            self._focal_length, self.held_out = camera.mean_focal_length(), []
+            self.held_out, self._scales = [], []
             pair_ids, geometries = database.read_two_view_geometries()
             chosen = np.random.default_rng(self._seed).random(len(pair_ids)) < share
             for pair_id, geometry, is_chosen in zip(pair_ids, geometries, chosen, strict=True):
                 if not is_chosen or len(geometry.inlier_matches) == 0:
                     continue
                 images = pycolmap.pair_id_to_image_pair(pair_id)
-                rays = [
-                    camera.cam_from_img(np.asarray(database.read_keypoints(image), np.float64)[rows, :2])
+                pixels = [
+                    np.asarray(database.read_keypoints(image), np.float64)[rows, :2]
                     for image, rows in zip(images, geometry.inlier_matches.T, strict=True)
                 ]
-                self.held_out.append((images, rays))
+                self.held_out.append((images, [camera.cam_from_img(ends) for ends in pixels]))
+                self._scales.append(np.sqrt(np.prod([_pixels_in_a_unit(camera, ends) for ends in pixels], 0)))
                 database.delete_two_view_geometry(*images)
                 database.delete_matches(*images)
 
@@ -226,13 +229,13 @@ class ColmapWorkspace:
         """
         poses = {image.image_id: image.cam_from_world() for image in placed_images(model)}
         fitting = total = 0
-        for (first, second), rays in self.held_out:
+        for ((first, second), rays), scale in zip(self.held_out, self._scales, strict=True):
             total += len(rays[0])
             if first not in poses or second not in poses:
                 continue
             essential = pycolmap.essential_matrix_from_pose(poses[second] * poses[first].inverse())
             errors = np.sqrt(pycolmap.compute_squared_sampson_error(rays[0], rays[1], essential))
-            fitting += int((errors * self._focal_length < _MAX_EPIPOLAR_ERROR).sum())
+            fitting += int((errors * scale < _MAX_EPIPOLAR_ERROR).sum())
         return fitting / total if total else None
 
     def reconstruct(self, refine_intrinsics: bool = False, start: Any = None) -> list[Any]:
@@ -358,6 +361,15 @@ def _choose_pairs(num_frames: int) -> list[tuple[int, int]]:
     keys = sorted({round(k) for k in np.linspace(0, num_frames - 1, min(num_frames, _NUM_KEY_FRAMES))})
     pairs |= {(i, j) for i in keys for j in keys if i < j}
     return sorted(pairs)
+
+
+def _pixels_in_a_unit(camera: Any, pixels: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return how many pixels a unit of the plane at depth 1 has at (N, 2) pixels.
+
+    Without a distortion it is the focal length. A fisheye lens stretches the plane several times towards the edges.
+    """
+    steps = [camera.cam_from_img(pixels + step) - camera.cam_from_img(pixels) for step in np.eye(2)]
+    return np.abs(np.linalg.det(np.stack(steps, -1))) ** -0.5
 
 
 def _largest_first(models: dict[int, Any]) -> list[Any]:
