@@ -233,6 +233,11 @@ class CameraIntrinsics:
         """Return the camera of the part of the sensor that begins at pixel (x, y) and has the given size in pixels."""
         return replace(self, width=width, height=height, cx=self.cx - x, cy=self.cy - y)
 
+    def scaled(self, factor: float) -> CameraIntrinsics:
+        """Return the camera of smaller pictures, whose sides are a factor times as long, rounded down."""
+        width, height, fx, fy, cx, cy = (factor * getattr(self, name) for name in ("width", "height", *_LIMITS))
+        return replace(self, width=int(width), height=int(height), fx=fx, fy=fy, cx=cx, cy=cy)
+
     def cameras(self, camera_to_worlds: Tensor) -> Cameras:
         """Return Nerfstudio's cameras with this lens. A fisheye's axis through a pixel's center moves by 0.001 pixels.
 

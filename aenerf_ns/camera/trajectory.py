@@ -212,8 +212,11 @@ class Trajectory(nn.Module):
         return self._time_without(self.times.diff() > longest_gap if longest_gap is not None else None)
 
     def time_without_gaps(self) -> TimeWindow:
-        """Return the span of the knots without its gaps, which are those of the spline that are also longer than twice
-        the median segment, because times may tremble."""
+        """Return the span of the knots without its gaps.
+
+        Gaps are the segments that the spline does not cross, if they are longer than twice the median: times may
+        tremble.
+        """
         steps = self.times.diff().double()
         return self._time_without(is_gap(steps) & (steps > 2 * steps.median()))
 

@@ -22,7 +22,7 @@ _GAP_FACTOR, _MAX_GAP_SHARE, _MIN_GAP_RATE = 5, 0.01, 0.01
 _EQUAL_POSES, _MAX_STILL_SHARE = 1e-12, 0.05
 # A jump is faster than the steps around it, and than the median, by this factor.
 _JUMP_FACTOR = 5
-# Radians. Less is what rounds off where a quaternion is written with few digits.
+# Radians. Poses at rest turn by less, by the last digit of their quaternions.
 _MIN_TURN = 1e-4
 
 
@@ -101,9 +101,8 @@ def check_steps(result: CheckResult, trajectory: Trajectory, window: TimeWindow)
         )
     seconds = np.diff(times) * 1e-9
     jumps = np.zeros(len(seconds), bool)
-    turns, moves = rotation_angle(poses[:-1], poses[1:]).numpy(), poses[..., 3].diff(dim=0).norm(dim=-1).numpy()
-    # Poses at rest step by the last digit that was written.
-    for steps, least in ((turns, _MIN_TURN), (moves, _JUMP_FACTOR * moves[moves > 0].min(initial=np.inf))):
+    turns, moves = rotation_angle(poses[:-1], poses[1:]), poses[..., 3].diff(dim=0).norm(dim=-1)
+    for steps, least in ((turns.numpy(), _MIN_TURN), (moves.numpy(), 0.0)):
         rates = steps / seconds
         padded = np.pad(rates, 3, mode="edge")
         around = np.max([padded[3 + k : 3 + k + len(rates)] for k in (-3, -2, 2, 3)], 0)

@@ -29,7 +29,7 @@ class PolarityBalance:
         self._last_time = np.zeros((file.height, file.width), np.int64)
         self._last_polarity = np.zeros((file.height, file.width), np.int8)
         self._ends = np.linspace(*file.time_span(), _NUM_PARTS + 1).astype(np.int64)[1:-1]
-        self._size = file.width, file.height
+        self._size = file.height, file.width
         # Thresholds by polarity, part and block.
         self._sums = np.zeros((2, _NUM_PARTS, _NUM_BLOCKS**2))
 
@@ -39,8 +39,8 @@ class PolarityBalance:
             events.x, events.y, events.t, events.p, self._last_time, self._last_polarity, self._refractory_period
         )
         place = np.searchsorted(self._ends, events.t)
-        for coordinates, side in zip((events.y, events.x), self._size[::-1], strict=True):
-            place = place * _NUM_BLOCKS + coordinates * _NUM_BLOCKS // side
+        for coordinates, side in zip((events.y, events.x), self._size, strict=True):
+            place = place * _NUM_BLOCKS + coordinates.astype(np.int64) * _NUM_BLOCKS // side
         for sums, polarity in zip(self._sums, (1, -1), strict=True):
             sums += np.bincount(place, weights * (events.p == polarity), sums.size).reshape(sums.shape)
         return weights
@@ -49,8 +49,8 @@ class PolarityBalance:
         """Return C+ / C− and its uncertainty, or None if there are hardly any events.
 
         The brightness of what is seen at the end differs from that at the beginning about as it does in between, and in
-        blocks of the sensor it differs independently: the uncertainty has twice the standard deviation of the balance
-        over time, the balances of the blocks, and 3 % of the ratio for sensors' faults.
+        blocks of the sensor it differs independently. The uncertainty has three parts: twice the standard deviation of
+        the balance over time, the root of the blocks' summed squares, and 3 % of the ratio for sensors' faults.
         """
         positive, negative = self._sums.sum(2).cumsum(1)
         if min(positive[-1], negative[-1]) < _MIN_EVENTS:

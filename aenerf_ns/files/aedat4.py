@@ -78,7 +78,7 @@ class Aedat4File(EventFile):
             stream = next(iter(streams))
         if stream not in streams:
             problem = "several streams hold events" if stream is None else f"stream {stream} holds no events"
-            raise DataError(path, problem, f"choose one of {', '.join(streams)} ({TOPIC_OPTION})")
+            raise DataError(path, problem, f"choose one of {', '.join(streams)}: {TOPIC_OPTION}")
         self._number = int(stream)
         super().__init__(path, *resolve_sensor_size(path, streams[stream], width, height))
 

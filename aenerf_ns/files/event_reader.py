@@ -20,7 +20,7 @@ from aenerf_ns.progress import progress_bar
 CHUNK = 1 << 20
 """Events that are read at once: 13 MB."""
 
-TOPIC_OPTION = "--event-topic, in aenerf --format-options event-topic=..."
+TOPIC_OPTION = "--event-topic, or --format-options event-topic=... of aenerf"
 """How to choose one of the streams of events in a file."""
 
 Columns = tuple[NDArray[np.uint16], NDArray[np.uint16], NDArray[np.int64], NDArray[np.int8]]

@@ -159,21 +159,23 @@ EVT2 = Encoding("EVT 2.0", np.dtype("<u4"), _decode_evt2, _EVT2_HIGH_BITS, 1 << 
 EVT3 = Encoding("EVT 3.0", np.dtype("<u2"), _decode_evt3, _EVT3_HIGH_BITS, 1 << 4)
 
 
+_JUMPS = "jumps of the camera's time by more than 65 ms, where events may be missing or its clock may have restarted"
+
+
 def without_damaged_times(blocks: Iterable[NDArray], encoding: Encoding, left_out: LeftOut) -> Iterator[NDArray]:
     """Blank out upper bits of a time that jump and come back within a few words, and the events that they would date.
 
     Such words would move all later events by up to a lap of the time. The very last upper bits are blanked out as well
     if they jump, because none confirm them, and the first ones if the next two contradict them. Jumps that stay are
-    noted: cameras send the time without a pause.
+    counted.
 
     Args:
         blocks: (N,) words in pieces, which may end anywhere.
         encoding: of the words.
-        left_out: takes the events that are blanked out, and the note.
+        left_out: takes the events that are blanked out, and the jumps that stay.
     """
     held, last = np.zeros(0, encoding.dtype), None
-    num_before = num_jumps = 0
-    first_jump = ""
+    num_before = 0
     for block in chain(blocks, (None,)):
         words = held if block is None else np.concatenate([held, block])
         where = np.flatnonzero(encoding.kinds(words) == TIME_HIGH)
@@ -191,20 +193,11 @@ def without_damaged_times(blocks: Iterable[NDArray], encoding: Encoding, left_ou
                     left_out.add_number("after a damaged time", number, f"at word {num_before + where[index]}")
             kept = np.delete(np.arange(num_judged), damaged)
             steps = np.diff(high[kept], prepend=last) & (1 << encoding.high_bits) - 1
-            jumps = np.flatnonzero(_jumps(steps, encoding))
-            if len(jumps) and not num_jumps:
-                seconds = steps[jumps[0]] * 0.065536 / encoding.max_steps
-                first_jump = f"by {seconds:.3g} s at word {num_before + where[kept[jumps[0]]]}"
-            num_jumps += len(jumps)
+            left_out.add_missing(_JUMPS, int(_jumps(steps, encoding).sum()))
             last = int(high[kept[-1]]) if len(kept) else last
         yield words[:end]
         held = words[end:]
         num_before += end
-    if num_jumps:
-        left_out.note(
-            f"jumps of the camera's time: {num_jumps}, the first {first_jump}. Events were lost there, or its clock "
-            "was restarted: cut the recording there."
-        )
 
 
 def _goes_on(before: NDArray | int, after: NDArray, encoding: Encoding) -> NDArray[np.bool_]:

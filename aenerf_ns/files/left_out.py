@@ -35,7 +35,7 @@ class LeftOut:
         self.waiting: list[NDArray] = []
         self._counts: Counter[str] = Counter()
         self._first: dict[str, str] = {}
-        self._notes: list[str] = []
+        self._missing: Counter[str] = Counter()
 
     def add(self, reason: str, bad: NDArray[np.bool_], describe: Callable[[int], str]) -> None:
         """Count the events of a piece that are left out for a reason; ``describe`` says where one is."""
@@ -47,9 +47,9 @@ class LeftOut:
         self._counts[reason] += number
         self._first.setdefault(reason, where)
 
-    def note(self, line: str) -> None:
-        """Keep a line to print on what a file lacks."""
-        self._notes.append(line)
+    def add_missing(self, what: str, number: int) -> None:
+        """Count what a file lacks."""
+        self._missing[what] += number
 
     def in_order(self, columns: Sequence[NDArray]) -> list[NDArray]:
         """Leave out and count the fewest events whose absence leaves the others in order.
@@ -81,7 +81,8 @@ class LeftOut:
     def print_once(self, path: Path) -> None:
         """Print what is left out of a file and what it lacks, each line once."""
         summary = self.summary()
-        for line in [*([f"events that are left out: {summary}."] if summary else []), *self._notes]:
+        lines = [f"events that are left out: {summary}."] if summary else []
+        for line in [*lines, *(f"{what}: {number:,}." for what, number in self._missing.items() if number)]:
             if line not in self._printed:
                 self._printed.add(line)
                 print(f"{path.name}: {line}")

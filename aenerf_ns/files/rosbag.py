@@ -10,6 +10,7 @@ event. Its AnyReader is not used: it refuses bags whose definitions of other mes
 
 from __future__ import annotations
 
+import re
 import shlex
 import struct
 from collections.abc import Iterator
@@ -116,11 +117,14 @@ class RosbagEventFile(EventFile):
         from rosbags.rosbag2 import Reader as Ros2Reader
         from rosbags.rosbag2 import ReaderError as Ros2ReaderError
 
-        if self._is_ros2:
+        is_mcap = self.path.is_file() and _begins(self.path, _MCAP_MAGIC)
+        if self.path.is_dir():
+            _require_distinct_files(self.path / "metadata.yaml")
+        elif self._is_ros2:
             _require_whole_bag(self.path)
-        if self.path.is_file() and _begins(self.path, _MCAP_MAGIC):
-            _require_records(self.path)
-        elif not self._is_ros2:
+            if is_mcap:
+                _require_records(self.path)
+        else:
             with self.path.open("rb") as file:
                 if b"index_pos=" + bytes(8) in file.read(_ROS1_HEADER_BYTES):
                     problem = "it has no index, as if interrupted"
@@ -129,8 +133,10 @@ class RosbagEventFile(EventFile):
             with Ros2Reader(self.path) if self._is_ros2 else Ros1Reader(self.path) as reader:
                 yield reader
         except (Ros1ReaderError, Ros2ReaderError) as error:
+            if self._is_ros2 and not is_mcap:
+                raise
             # A recording that was interrupted lacks its end.
-            repair = "mcap recover" if self._is_ros2 else "rosbag reindex"
+            repair = "mcap recover" if is_mcap else "rosbag reindex"
             problem = f"not a readable {self.kind} ({error})"
             raise DataError(self.path, problem, f"copy it again, or repair one that was cut off ({repair})") from error
 
@@ -171,13 +177,12 @@ class RosbagEventFile(EventFile):
 
         # The decoder's state is of no use at the first packet and after lost packets, where the sequence jumps.
         numbered = enumerate(self._messages(start))
-        lost: list[tuple[int, int]] = []
         before = None
         for ahead, run in groupby(numbered, lambda pair: (pair[1].sequence or 0) - pair[0]):
             messages = (message for _, message in run)
             first = next(messages)
-            if before is not None and ahead > before:
-                lost.append((ahead - before, first.stamp))
+            if before is not None and ahead > before and start is None:
+                self.left_out.add_missing("packets that were lost when it was recorded", ahead - before)
             before = ahead
             words_of_packets = map(self._words, chain([first], messages))
             blocks = without_damaged_times(words_of_packets, EVT3, self.left_out)
@@ -187,11 +192,6 @@ class RosbagEventFile(EventFile):
                     laps = round((first.stamp - self._clock_offset - time) / _LAP)
                     state = initial_state(self._clock_offset + laps * _LAP)
                     yield from decode_words(chain([words], blocks), EVT3, state, self.path)
-        if lost:
-            self.left_out.note(
-                f"packets that were lost when it was recorded: {sum(number for number, _ in lost)}, the first before "
-                f"{lost[0][1]} ns. Their events are missing."
-            )
 
     def _words(self, message: _Message) -> NDArray[np.uint16]:
         if message.encoding != "evt3":
@@ -241,18 +241,23 @@ def _begins(path: Path, magic: bytes) -> bool:
 
 
 def _require_whole_bag(path: Path) -> None:
-    """Raise a DataError for one file of a bag of ROS 2 that was split, and for a bag that lists a file twice."""
-    metadata = (path if path.is_dir() else path.parent) / "metadata.yaml"
-    if path.is_file() and not metadata.is_file():
+    """Raise a DataError for one file of a bag of ROS 2 that was split. The metadata beside it list the others."""
+    metadata = path.parent / "metadata.yaml"
+    if not metadata.is_file():
         return
-    # It has some kilobytes for each topic that many nodes publish.
-    stated = read_plain_yaml(metadata, MAX_HEADER).get("rosbag2_bagfile_information", {})
-    names = stated.get("relative_file_paths", [])
-    if path.is_file() and len(names) > 1 and path.name in [Path(name).name for name in names]:
+    # Other programs use this name, too, so it need not be YAML that can be read.
+    with metadata.open(encoding="utf-8", errors="replace") as file:
+        listed = re.findall(r"^\s*- (\S+\.(?:mcap|db3)\S*)\s*$", file.read(MAX_HEADER), re.MULTILINE)
+    if len(listed) > 1 and path.name in [Path(name).name for name in listed]:
         remedy = f"give its folder: --events {shlex.quote(str(path.parent))}, in aenerf --format-options events=..."
-        raise DataError(path, f"it is one of the {len(names)} files of a bag", remedy)
-    if path.is_dir() and len(set(names)) < len(names):
-        # Each would be read as often as it is listed.
+        raise DataError(path, f"it is one of the {len(listed)} files of a bag", remedy)
+
+
+def _require_distinct_files(metadata: Path) -> None:
+    """Raise a DataError for a bag of ROS 2 that lists a file twice: it would be read as often as it is listed."""
+    # It has some kilobytes for each topic that many nodes publish.
+    names = read_plain_yaml(metadata, MAX_HEADER)["rosbag2_bagfile_information"]["relative_file_paths"]
+    if len(set(names)) < len(names):
         raise DataError(metadata, f"it lists {len(names)} files, {len(set(names))} of them distinct", "list each once")
 
 
@@ -284,7 +289,7 @@ def _choose(path: Path, types: dict[str, str], topic: str | None) -> str:
         problem = f"no topic holds events; the bag holds {found}"
         raise DataError(path, problem, "EventArray of dvs_msgs and EventPacket are read")
     problem = "several topics hold events" if topic is None else f"topic {topic} holds no events"
-    raise DataError(path, problem, f"choose one of {', '.join(known)} as topic ({TOPIC_OPTION})")
+    raise DataError(path, problem, f"choose one of {', '.join(known)} as topic: {TOPIC_OPTION}")
 
 
 class _Fields:

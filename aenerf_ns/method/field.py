@@ -113,7 +113,7 @@ class DensityField(Field):
         positions, inside = _unit_positions(self, ray_samples)
         inputs = [positions]
         if isinstance(self.encoding, IntegratedEncoding):
-            inputs.append(torch.where(inside, _unit_variances(self, ray_samples), 0.0))
+            inputs.append(_unit_variances(self, ray_samples))
         encoded = self.encoding(*(values.flatten(0, -2) for values in inputs))
         raw = self.density_network(encoded).unflatten(0, positions.shape[:-1])
         raw_density, feature = raw.split([1, raw.shape[-1] - 1], dim=-1)
@@ -201,8 +201,7 @@ def _unit_positions(field: DensityField | ProposalNetwork, ray_samples: RaySampl
         positions = field.to_field_space(positions)
     positions = to_unit_cube(positions, field.spatial_distortion, field.aabb)
     inside = ((positions > 0) & (positions < 1)).all(-1, keepdim=True)
-    # Not a product: rays that miss the viewer's crop box have infinite positions.
-    return torch.where(inside, positions, 0.0), inside
+    return positions * inside, inside
 
 
 def _unit_variances(field: DensityField, ray_samples: RaySamples) -> Tensor:

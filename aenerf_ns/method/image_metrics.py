@@ -37,8 +37,7 @@ class ImageMetrics:
         Args:
             predicted: (H, W, 3).
             reference: (H, W, 3).
-            mask: (H, W, 1) the pixels that count, by default all. SSIM and LPIPS, which look at areas, take the others
-                for equal.
+            mask: (H, W, 1) the pixels that count, by default all.
 
         Raises:
             DataError: the image is smaller than SSIM's window.
@@ -50,19 +49,21 @@ class ImageMetrics:
         # Imported lazily: every ns-* command imports this module, and torchmetrics is slow to import.
         from torchmetrics.functional.image import peak_signal_noise_ratio, structural_similarity_index_measure
 
+        # What does not count is made equal, and the means are those over the rest.
         share = 1.0
         if mask is not None:
             predicted, share = torch.where(mask.to(predicted.device), predicted, reference), float(mask.float().mean())
         predicted, reference = (image.moveaxis(-1, 0)[None].float() for image in (predicted, reference))
         psnr = float(peak_signal_noise_ratio(predicted, reference, data_range=1.0)) + 10 * math.log10(share)
+        ssim = structural_similarity_index_measure(predicted, reference, data_range=1.0)
         metrics = {
             "psnr": min(psnr, _MAX_PSNR),
-            "ssim": float(torch.as_tensor(structural_similarity_index_measure(predicted, reference, data_range=1.0))),
+            "ssim": 1 - (1 - float(torch.as_tensor(ssim))) / share if share < 1 else float(torch.as_tensor(ssim)),
         }
         if self._lpips is None and self.lpips_absent is None:
             self._build_lpips(predicted.device)
         if self._lpips is not None:
-            metrics["lpips"] = float(self._lpips(predicted, reference))
+            metrics["lpips"] = float(self._lpips(predicted, reference)) / share
         return metrics
 
     def _build_lpips(self, device: torch.device) -> None:

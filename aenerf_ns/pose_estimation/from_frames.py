@@ -60,7 +60,7 @@ def estimate_poses(
     """
     times = np.asarray(times, np.int64)
     if len(times) < 3:
-        remedy = "poses can be estimated from three frames or more; a recording of your own lists them in images.txt"
+        remedy = "poses can be estimated from three frames or more: list them in images.txt, or give others"
         raise DataError(source, f"{len(times)} frames", remedy)
     if len(backward := np.flatnonzero(np.diff(times) <= 0)):
         raise DataError(source, f"frame {backward[0] + 1} is not after the frame before it", "sort the frames by time")

@@ -99,8 +99,11 @@ class EventDataParser(DataParser):
                 self._check_lens(capture.event_camera, "event camera")
                 return capture, sorted(frames)
             recording = self._recording
-            # Poses may be estimated at more times than those of the given ones.
-            return recording, recording.frames if self.poses_path() is None else sorted(self.read_capture()[1])
+            found = dict(recording.frames)
+            if self.poses_path() is not None:
+                # Poses may be estimated at more times than those of the given ones.
+                found = dict(self.read_capture()[1]) | found
+            return recording, sorted(found.items())
 
     @property
     def recording(self) -> Recording:

@@ -48,7 +48,7 @@ class EventDataset(InputDataset):
     @cached_property
     def usable(self) -> Tensor:
         """(height, width) whether the lens model gives a pixel of the split's cameras a direction."""
-        return torch.from_numpy(self.scene.camera.pixel_directions()[1])
+        return torch.from_numpy(self.scene.camera.scaled(self.scale_factor).pixel_directions()[1])
 
     def get_metadata(self, data: dict[str, Any]) -> dict[str, Any]:
         """Return the framework's mask (height, width, 1) of the pixels to compare: those that have a direction."""

@@ -379,9 +379,13 @@ def test_frames_that_hardly_fit_tell_no_thresholds() -> None:
 
 def test_the_last_digit_of_poses_at_rest_is_no_jump(shorter: Path) -> None:
     def drift(poses: torch.Tensor) -> torch.Tensor:
-        still = torch.eye(4, dtype=poses.dtype).repeat(len(poses), 1, 1)
-        still[:, 0, 3] = (torch.arange(len(poses)) * 4e-6).round(decimals=4)
-        return still
+        # A slider, and a turn of 0.01 degrees with six digits.
+        moved = torch.eye(4, dtype=poses.dtype).repeat(len(poses), 1, 1)
+        moved[:, 0, 3] = torch.arange(len(poses)) * 0.01
+        angles = 2 * torch.linspace(0, 1e-4, len(poses), dtype=poses.dtype).round(decimals=6)
+        moved[:, 0, 0] = moved[:, 1, 1] = angles.cos()
+        moved[:, 1, 0], moved[:, 0, 1] = angles.sin(), -angles.sin()
+        return moved
 
     change_poses(shorter, drift)
     assert "the poses jump" not in run(shorter)[1]

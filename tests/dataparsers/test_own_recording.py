@@ -101,13 +101,13 @@ def test_intrinsics_may_be_missing(truth: Truth) -> None:
     parser = OwnRecordingDataParserConfig(data=truth.data).setup()
     with pytest.raises(DataError, match=r"intrinsics .* are not known; calibrate it, or .* --poses events"):
         parser.get_dataparser_outputs("train")
-    # Poses that are given can still be compared with.
+    # Poses that are given can still be compared with. The last frame is after them.
     recording, frames = parser.read_frames()
     assert isinstance(recording, Recording)
     assert recording.intrinsics_origin == "guessed"
     assert (recording.event_camera.width, recording.event_camera.height) == (60, 40)
     assert recording.sensor == SensorModel(0.3, 0.2, 100)
-    assert len(frames) == 3
+    assert len(frames) == 4
     assert recording.image_encoding == "linear"
     # A part of a lens is a mistake.
     camera = meta["event_camera"]

@@ -59,6 +59,7 @@ def test_eventnerf_splits_and_images(tmp_path: Path) -> None:
     assert recording.sensor.bayer_pattern == "RGGB"
     num_views = {split: len(views) for split, views in recording.reference_views.items()}
     assert num_views == {"train": 21, "val": 3, "test": 2}
+    assert len(config_of("eventnerf-data", truth.data).setup().read_frames()[1]) == 21
     assert [view.time for view in recording.reference_views["train"]] == truth.times.tolist()
     np.testing.assert_allclose(recording.reference_views["test"][1].camera_to_world.numpy(), truth.poses[1], atol=1e-12)
     assert recording.scene_box is not None

@@ -240,8 +240,7 @@ def test_a_jump_of_the_time_that_stays_is_named(folder: Path, capsys: pytest.Cap
     path = folder / "restarted.raw"
     path.write_bytes(HEADER3 + np.array([*events(0x700), *events(0x100)], "<u2").tobytes())
     assert len(read(open_event_file(path))) == 18
-    # By 0xA00 - 8 steps of 4.096 ms.
-    said = "restarted.raw: jumps of the camera's time: 1, the first by 10.5 s at word 36. Events were lost there"
+    said = "restarted.raw: jumps of the camera's time by more than 65 ms, where events may be missing or its clock may "
     assert capsys.readouterr().out.count(said) == 1
 
 

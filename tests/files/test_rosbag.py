@@ -82,7 +82,7 @@ def test_lost_packets_reset_the_decoder(folder: Path, capsys: pytest.CaptureFixt
     path = write_bag(folder / "lost.bag", {"/events": (PACKET, [messages[0], messages[2]])})
     # The events of the last packet before its row are at no known place.
     assert read(open_event_file(path))[:, :2].tolist() == [[1, 5], [4, 7]]
-    said = f"lost.bag: packets that were lost when it was recorded: 1, the first before {START + 2} ns"
+    said = "lost.bag: packets that were lost when it was recorded: 1."
     assert capsys.readouterr().out.count(said) == 1
 
 

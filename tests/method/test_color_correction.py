@@ -204,7 +204,12 @@ def test_pixels_without_a_direction_are_not_fitted(tmp_path: Path) -> None:
         Image.fromarray(np.where(usable[..., None], np.uint8(102), np.uint8(255)).repeat(3, -1)).save(image)
     pipeline = make_pipeline(tmp_path / "made", "val")
     pipeline.color_fit.fit()
-    rays = pipeline.datamanager.reference_views("val").cameras[0:1].generate_rays(0, keep_shape=False)
+    views = pipeline.datamanager.reference_views("val")
+    assert views[0]["mask"][..., 0].tolist() == usable.tolist()
+    # Pictures of half the size.
+    small = type(views)(views._dataparser_outputs, scale_factor=0.5)
+    assert small[0]["mask"].shape[:2] == small[0]["image"].shape[:2] == (2, 3)
+    rays = views.cameras[0:1].generate_rays(0, keep_shape=False)
     shown = pipeline.model.eval()(rays)["rgb"].unflatten(0, (4, 6))[torch.from_numpy(usable)]
     torch.testing.assert_close(shown, torch.full_like(shown, 0.4), atol=0.02, rtol=0)
 

@@ -205,16 +205,6 @@ def test_a_camera_within_the_box_sees_nothing_nearer_than_the_near_plane() -> No
     assert model(rays)["accumulation"].max() < 1e-3
 
 
-@pytest.mark.parametrize("backbone", ["hash", "mlp"])
-def test_rays_that_miss_the_viewer_s_crop_box_see_nothing(backbone: str) -> None:
-    model, rays = make_model(backbone=backbone).eval(), make_rays(5)
-    # As the framework marks such rays.
-    rays.nears = rays.fars = torch.full((5, 1), 1e10)
-    outputs = model(rays)
-    for name in ("rgb", "uncorrected_rgb", "log_radiance", "accumulation"):
-        assert outputs[name].isfinite().all(), name
-
-
 def test_image_metrics_compare_with_what_the_sensor_sees() -> None:
     model = make_model().eval()
     reference = torch.rand(16, 16, 3)
