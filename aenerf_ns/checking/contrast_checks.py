@@ -29,8 +29,10 @@ _MAX_DISTANCE = 50
 _MIN_TILE_CONTRAST = 0.5
 
 
-def check_contrast(result: CheckResult, warped: WarpedEvents, is_simple: bool) -> bool:
+def check_contrast(result: CheckResult, warped: WarpedEvents, is_simple: bool) -> bool | None:
     """Compare the given poses with the alternatives and with shuffled events, and return whether the poses fit.
+
+    Too few events do not tell: None.
 
     ``is_simple`` says that a simpler problem was found, which may be the reason of all that this finds.
     """
@@ -56,7 +58,7 @@ def check_contrast(result: CheckResult, warped: WarpedEvents, is_simple: bool) -
     if is_simple or num_slices < _MIN_SLICES:
         reason = "what is wrong above" if is_simple else "too few events"
         figures.append(f"Because of {reason}, the contrast does not tell whether poses, lens and clock are right.")
-        return not is_simple
+        return False if is_simple else None
     better = [
         c
         for c in alternatives

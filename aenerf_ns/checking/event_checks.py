@@ -127,6 +127,21 @@ def check_thresholds(
         )
 
 
+def check_principal_point(result: CheckResult, camera: CameraIntrinsics) -> None:
+    """Compare the principal point with the middle of the sensor."""
+    if _is_off_center(camera):
+        result.problems.append(
+            f"the principal point ({camera.cx:g}, {camera.cy:g}) is far from the middle of {camera.width} x "
+            f"{camera.height} pixels, as of another resolution: check the intrinsics, unless this is a part of a "
+            "larger sensor"
+        )
+
+
+def _is_off_center(camera: CameraIntrinsics) -> bool:
+    shares = camera.cx / camera.width, camera.cy / camera.height
+    return any(abs(share - 0.5) > _MAX_PRINCIPAL_POINT for share in shares)
+
+
 def check_lens(result: CheckResult, camera: CameraIntrinsics) -> None:
     """Compare the lens with the sensor and with where the events are."""
     height, width = result.statistics.counts.shape
@@ -143,13 +158,9 @@ def check_lens(result: CheckResult, camera: CameraIntrinsics) -> None:
             "principal point)"
         )
     point = camera.cx, camera.cy
-    shares = camera.cx / width, camera.cy / height
-    if any(abs(share - 0.5) > _MAX_PRINCIPAL_POINT for share in shares):
-        result.problems.append(
-            f"the principal point ({camera.cx:g}, {camera.cy:g}) is far from the middle of {width} x {height} pixels, "
-            "as of another resolution: check the intrinsics, unless this is a part of a larger sensor"
-        )
-    elif math.dist(point, (height / 2, width / 2)) < math.dist(point, (width / 2, height / 2)):
+    if not _is_off_center(camera) and math.dist(point, (height / 2, width / 2)) < math.dist(
+        point, (width / 2, height / 2)
+    ):
         result.problems.append(
             f"the principal point ({camera.cx:g}, {camera.cy:g}) seems to have x and y swapped, for {width} x {height} "
             "pixels: check the intrinsics"

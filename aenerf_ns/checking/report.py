@@ -10,7 +10,13 @@ import numpy as np
 from aenerf_ns.camera.time_window import TimeWindow
 from aenerf_ns.checking.contrast import MIN_EVENTS, WarpedEvents, choose_runs, longest_stretches
 from aenerf_ns.checking.contrast_checks import check_contrast, check_depth
-from aenerf_ns.checking.event_checks import check_events, check_lens, check_polarity, check_thresholds
+from aenerf_ns.checking.event_checks import (
+    check_events,
+    check_lens,
+    check_polarity,
+    check_principal_point,
+    check_thresholds,
+)
 from aenerf_ns.checking.frames import FrameChanges
 from aenerf_ns.checking.noise import NoiseRate
 from aenerf_ns.checking.pose_checks import check_poses, check_steps
@@ -41,6 +47,7 @@ def check(
     result, num_posed, num_covered = _check_events(recording, frames, window)
     if not isinstance(recording, Recording):
         check_lens(result, recording.event_camera)
+        check_principal_point(result, recording.event_camera)
         return result
     check_poses(result, recording, window, num_posed)
     num_problems = len(result.problems)
@@ -51,16 +58,25 @@ def check(
     runs = _read_runs(recording, window, num_covered) if num_covered >= MIN_EVENTS else []
     runs = longest_stretches(runs, window)
     if not runs:
+        check_principal_point(result, recording.event_camera)
         result.figures.append(
             f"Contrast of warped events: not computed, because no {MIN_EVENTS} events have poses without a gap."
         )
         return result
+    num_problems = len(result.problems)
     with progress_bar() as progress:
         progress.add_task("Warping events", total=None)
         result.warped = WarpedEvents(runs, recording.trajectory, recording.event_camera)
         poses_fit = check_contrast(result, result.warped, is_simple)
+    if not poses_fit:
+        # It may be the reason of all that the contrast finds. That of a part of a sensor may be anywhere, and fits.
+        found = result.problems[num_problems:]
+        del result.problems[num_problems:]
+        check_principal_point(result, recording.event_camera)
+        if len(result.problems) == num_problems:
+            result.problems += found
     # Poses that do not fit give wrong depths.
-    if poses_fit:
+    if poses_fit is not False:
         check_depth(result, result.warped, recording, scale)
     return result
 

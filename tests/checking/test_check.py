@@ -26,6 +26,7 @@ from aenerf_ns.checking.hypotheses import clock_hypothesis
 from aenerf_ns.checking.pose_checks import check_poses
 from aenerf_ns.checking.report import check
 from aenerf_ns.cli.check import Check
+from aenerf_ns.cli.convert import Convert
 from aenerf_ns.dataparsers.native import NativeDataParserConfig
 from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.events.stream import EventStream
@@ -433,6 +434,14 @@ def test_a_lens_of_another_size_is_no_wrong_axes(changes: dict, problems: list[s
     assert status == 1
     assert all(problem in output for problem in problems)
     assert "as if" not in output.split("problem")[-1]
+
+
+def test_a_part_of_the_sensor_may_have_its_principal_point_anywhere(shorter: Path, tmp_path: Path) -> None:
+    Convert(shorter, tmp_path / "part", region=(0, 0, 64, 24)).main()
+    status, output = run(tmp_path / "part")
+    assert status == 0, output
+    assert "principal point" not in output
+    assert "--pipeline.model.near-plane" in output
 
 
 def test_a_lens_that_ends_before_the_events_is_named(shorter: Path) -> None:
