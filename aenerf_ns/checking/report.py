@@ -69,7 +69,8 @@ def check(
         result.warped = WarpedEvents(runs, recording.trajectory, recording.event_camera)
         poses_fit = check_contrast(result, result.warped, is_simple)
     if not poses_fit:
-        # It may be the reason of all that the contrast finds. That of a part of a sensor may be anywhere, and fits.
+        # A wrong principal point may be the reason of all that the contrast finds. In a part of a sensor, poses fit
+        # wherever it lies.
         found = result.problems[num_problems:]
         del result.problems[num_problems:]
         check_principal_point(result, recording.event_camera)

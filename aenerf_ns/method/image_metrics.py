@@ -49,7 +49,7 @@ class ImageMetrics:
         # Imported lazily: every ns-* command imports this module, and torchmetrics is slow to import.
         from torchmetrics.functional.image import peak_signal_noise_ratio, structural_similarity_index_measure
 
-        # What does not count is made equal, and the means are those over the rest.
+        # Pixels that do not count become equal to the reference. The means are then scaled to the other pixels.
         share = 1.0
         if mask is not None:
             predicted, share = torch.where(mask.to(predicted.device), predicted, reference), float(mask.float().mean())

@@ -51,8 +51,9 @@ class EventDataset(InputDataset):
         return torch.from_numpy(self.scene.camera.scaled(self.scale_factor).pixel_directions()[1])
 
     def get_metadata(self, data: dict[str, Any]) -> dict[str, Any]:
-        """Return the framework's mask (height, width, 1) of the pixels to compare: those that have a direction."""
-        return {"mask": self.usable[..., None]}
+        """Return the framework's mask (height, width, 1) of the pixels of a reference view that have a direction."""
+        # The viewer shows training cameras. To find their directions would delay its start by seconds.
+        return {} if len(self.scene.camera_times) else {"mask": self.usable[..., None]}
 
     @cached_property
     def polarity_drift(self) -> PolarityDrift:

@@ -44,7 +44,7 @@ def test_psnr_by_hand_and_lpips_is_absent_unless_asked_for() -> None:
     assert values["psnr"] == pytest.approx(-20 * math.log10(0.1), abs=1e-3)
     assert 0 < values["ssim"] < 1
     assert metrics(reference, reference)["psnr"] == 100
-    # What is not compared changes nothing.
+    # Pixels outside the mask change nothing.
     mask = torch.arange(16).expand(16, 16)[..., None] < 13
     masked = metrics(torch.where(mask, reference + 0.1, -5.0), reference, mask)
     assert masked["psnr"] == pytest.approx(values["psnr"])

@@ -273,7 +273,7 @@ def test_photometric_refinement_finds_the_camera_back() -> None:
         return float((places[0] - places[1]).norm(dim=-1).max())
 
     assert pixels_off(wrong.camera_to_worlds) > 0.8
-    # What the picture shows where the lens gives no direction does not count.
+    # Pixels without a direction do not count, whatever the picture shows there.
     usable = torch.arange(32).expand(24, 32) < 28
     image[~usable] = 0.7
     refined = refine_camera(model, wrong, image, usable)
