@@ -358,13 +358,36 @@ def _finish(rows, row, num_chains, refractory_period, block_ends):
 
 
 @numba.njit(cache=True)
-def _add_line(sums, squares, products, part):
-    """Add the points of a line to those of a part, each line with a constant of its own, and begin a new line."""
-    n, x, y, xx, xy = sums
-    if n > 0:
-        squares[part] += xx - x * x / n
-        products[part] += xy - x * y / n
-    sums[:] = 0
+def _fit_lines(rows):
+    """Return for rows of one pixel the slope of :func:`surplus_slopes`, and the sum of squares.
+
+    Each chain has a line with a constant of its own.
+    """
+    squares = products = number = surplus = 0.0
+    # Of the points of a line: their number, sums of events and of surplus, and of their products.
+    n = x = y = xx = xy = 0.0
+    for row in range(rows.shape[0] + 1):
+        # Zero is a chain start: it ends the last line.
+        packed = rows[row, 1] if row < rows.shape[0] else 0
+        if (packed >> SPAN_SHIFT) & SPAN_MASK == 0:
+            if n > 0:
+                squares += xx - x * x / n
+                products += xy - x * y / n
+            n = x = y = xx = xy = 0.0
+        elif row > 0:
+            before = rows[row - 1, 1]
+            if (before >> SPAN_SHIFT) & SPAN_MASK == 0:
+                before = 0
+            positive = (packed - before) & COUNT_MASK
+            negative = ((packed >> NEGATIVE_SHIFT) - (before >> NEGATIVE_SHIFT)) & COUNT_MASK
+            number += (positive + negative) / COUNT_UNIT
+            surplus += (positive - negative) / COUNT_UNIT
+        n += 1
+        x += number
+        y += surplus
+        xx += number * number
+        xy += number * surplus
+    return products / squares if squares > 0 else 0.0, squares
 
 
 @numba.njit(cache=True)
@@ -379,44 +402,14 @@ def surplus_slopes(rows, num_pixels):
         (3, pixels) float64 slopes, over all events of a pixel and over each half of them, 0 where there are too few,
         and sums of squares of the numbers of events around their means, which tell how well the slopes are known.
     """
-    slopes, all_squares = np.zeros((2, 3, num_pixels))
-    # Of a chain, and of the part of it in one half: number, sums of events and of surplus, and of their products.
-    whole, half = np.zeros(5), np.zeros(5)
-    squares, products = np.zeros(3), np.zeros(3)
-    row = 0
-    while row < rows.shape[0]:
-        pixel = rows[row, 1] >> PIXEL_SHIFT
-        count = 1
-        while row + count < rows.shape[0] and rows[row + count, 1] >> PIXEL_SHIFT == pixel:
-            count += 1
-        squares[:] = products[:] = 0
-        number = surplus = 0.0
-        for i in range(count):
-            packed = rows[row, 1]
-            starts_chain = (packed >> SPAN_SHIFT) & SPAN_MASK == 0
-            if starts_chain:
-                _add_line(whole, squares, products, 0)
-            if starts_chain or i == count // 2:
-                _add_line(half, squares, products, 1 if i <= count // 2 else 2)
-            if not starts_chain:
-                before = rows[row - 1, 1]
-                if (before >> SPAN_SHIFT) & SPAN_MASK == 0:
-                    before = 0
-                positive = (packed - before) & COUNT_MASK
-                negative = ((packed >> NEGATIVE_SHIFT) - (before >> NEGATIVE_SHIFT)) & COUNT_MASK
-                number += (positive + negative) / COUNT_UNIT
-                surplus += (positive - negative) / COUNT_UNIT
-            for sums in (whole, half):
-                sums[0] += 1
-                sums[1] += number
-                sums[2] += surplus
-                sums[3] += number * number
-                sums[4] += number * surplus
-            row += 1
-        _add_line(whole, squares, products, 0)
-        _add_line(half, squares, products, 2)
-        all_squares[:, pixel] = squares
-        for part in range(3):
-            if squares[part] > 0:
-                slopes[part, pixel] = products[part] / squares[part]
-    return slopes, all_squares
+    slopes, squares = np.zeros((2, 3, num_pixels))
+    begin = 0
+    while begin < rows.shape[0]:
+        pixel, end = rows[begin, 1] >> PIXEL_SHIFT, begin + 1
+        while end < rows.shape[0] and rows[end, 1] >> PIXEL_SHIFT == pixel:
+            end += 1
+        middle = begin + (end - begin) // 2
+        for part, (first, last) in enumerate(((begin, end), (begin, middle), (middle, end))):
+            slopes[part, pixel], squares[part, pixel] = _fit_lines(rows[first:last])
+        begin = end
+    return slopes, squares
