@@ -7,7 +7,7 @@ The world's z axis points up. Lengths are in meters.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal, Protocol
 
@@ -175,21 +175,18 @@ class ObjectPath(CameraPath):
     def _validation_view(self, k: int, count: int) -> Array:
         # The views lie on a golden-angle spiral. A view turns about the vertical until it is clear of the mesh.
         elevation = np.arcsin((k + 0.5) / count)
-        return self._first_free(
-            self._pose(2.399963 * k + 0.1 * i, elevation, self._radius, ORIGIN) for i in range(_MAX_TRIES)
-        )
+        return self._first_free(lambda i: self._pose(2.399963 * k + 0.1 * i, elevation, self._radius, ORIGIN))
 
     def _test_view(self, rng: np.random.Generator) -> Array:
-        def candidates() -> Iterator[Array]:
-            for _ in range(_MAX_TRIES):
-                azimuth, elevation = rng.uniform(0, 2 * np.pi), np.arcsin(rng.uniform(0, 1))
-                distance, target = rng.uniform(3.6, 4.4), rng.uniform(-0.15, 0.15, 3)
-                yield self._pose(azimuth, elevation, self._radius / 4.0 * distance, self._radius / 4.0 * target)
+        def candidate(_: int) -> Array:
+            azimuth, elevation = rng.uniform(0, 2 * np.pi), np.arcsin(rng.uniform(0, 1))
+            distance, target = rng.uniform(3.6, 4.4), rng.uniform(-0.15, 0.15, 3)
+            return self._pose(azimuth, elevation, self._radius / 4.0 * distance, self._radius / 4.0 * target)
 
-        return self._first_free(candidates())
+        return self._first_free(candidate)
 
-    def _first_free(self, candidates: Iterator[Array]) -> Array:
-        for pose in candidates:
+    def _first_free(self, candidate: Callable[[int], Array]) -> Array:
+        for pose in map(candidate, range(_MAX_TRIES)):
             if self._space.is_free(pose[:3, 3]):
                 return pose
         raise DataError("views around the scene", "no position is clear of the mesh", "give its path a larger radius")
