@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
 from msgspec import Meta, Struct
@@ -14,7 +14,7 @@ from aenerf_ns.errors import DataError, value_errors_as_data_error
 from aenerf_ns.files.json_file import read_json
 from aenerf_ns.files.limits import file_inside
 from aenerf_ns.simulator.arrays import Array
-from aenerf_ns.simulator.blender import BlenderRenderer
+from aenerf_ns.simulator.blender import BlenderRenderer, CameraTrack
 from aenerf_ns.simulator.locomotive import locomotive_scene
 from aenerf_ns.simulator.options import BLENDER_SUFFIX, BUILT_IN, DURATIONS, require_scene_file
 from aenerf_ns.simulator.paths import CameraPath, ObjectPath, Obstacles, RoomPath, TrackPath, WalkPath
@@ -83,12 +83,14 @@ class _Around(Struct, tag_field="kind", tag="around", forbid_unknown_fields=True
     radius: _Scale | None = None
     turns: Annotated[float, Meta(ge=1e-3, le=1e3)] = 4.0
     duration: _Duration = 4.0
+    focal_ratio: ClassVar[float] = 1.2
 
 
 class _Walk(Struct, tag_field="kind", tag="walk", forbid_unknown_fields=True, frozen=True):
     positions: _Points
     targets: _Points
     duration: _Duration = 4.0
+    focal_ratio: ClassVar[float] = 0.62
 
 
 class _SceneFile(Struct, forbid_unknown_fields=True, frozen=True):
@@ -181,14 +183,8 @@ def _load_scene(path: Path, seed: int) -> SimulationScene:
     else:
         lamps = [AreaLight(*astuple(lamp)) for lamp in values.light.lamps]
         renderer = light_mesh(mesh, environment, lamps, background, seed=seed)
-    scene = SimulationScene(
-        renderer,
-        camera_path,
-        focal_ratio=values.focal_ratio or _focal_ratio(route),
-        aabb=_scene_box(values, route, bounds, background),
-        duration=route.duration,
-        notes=tuple(notes),
-    )
+    focal_ratio, aabb = values.focal_ratio or route.focal_ratio, _scene_box(values, route, bounds, background)
+    scene = SimulationScene(renderer, camera_path, focal_ratio, aabb, route.duration, tuple(notes))
     return scene if environment is None else _with_exposure(path, scene, renderer)
 
 
@@ -198,38 +194,27 @@ def _load_blend(path: Path, file: Path, values: _SceneFile, seed: int) -> Simula
     for name in ("up", "materials", "light"):
         if getattr(values, name) != getattr(default, name):
             raise DataError(path, f"{name} is given, but a .blend has its own", f"leave {name} out")
-    route = values.path
-    renderer = BlenderRenderer(file, values.scale, values.background, route is None, seed)
-    track, notes = renderer.track, renderer.notes
-    if route is None and track is None:
+    renderer = BlenderRenderer(file, values.scale, values.background, values.path is None, seed)
+    notes = renderer.notes
+    if values.path is None and renderer.track is None:
         notes += (f"{path}: seen from around it, because its camera does not move (a scene.json can say otherwise)",)
-    focal_ratio = values.focal_ratio or (track.focal_ratio if track is not None else _focal_ratio(route))
+    route = renderer.track or values.path or _Around()
+    focal_ratio = values.focal_ratio or route.focal_ratio
     camera_path: CameraPath
-    if track is not None:
+    if isinstance(route, CameraTrack):
         # A gaze that turns by more would leave what the camera looks at.
-        camera_path, duration = TrackPath(track.poses, 0.31 / focal_ratio, renderer), track.duration
+        camera_path = TrackPath(route.poses, 0.31 / focal_ratio, renderer)
     else:
-        route = route or _Around()
-        camera_path, duration = _make_path(path, route, renderer.bounds, renderer), route.duration
-    scene = SimulationScene(
-        renderer,
-        camera_path,
-        focal_ratio,
-        aabb=_scene_box(values, route, renderer.bounds, renderer.background),
-        duration=duration,
-        notes=notes,
-    )
+        camera_path = _make_path(path, route, renderer.bounds, renderer)
+    aabb = _scene_box(values, route, renderer.bounds, renderer.background)
+    scene = SimulationScene(renderer, camera_path, focal_ratio, aabb, route.duration, notes)
     width, height = 48, 36
     renderer.expose([scene.path((k + 0.5) / 12) for k in range(12)], scene.intrinsics(width, height), width, height)
     return scene
 
 
-def _focal_ratio(route: _Around | _Walk | None) -> float:
-    return 0.62 if isinstance(route, _Walk) else 1.2
-
-
 def _scene_box(
-    values: _SceneFile, route: _Around | _Walk | None, bounds: Array, background: Array | None
+    values: _SceneFile, route: _Around | _Walk | CameraTrack, bounds: Array, background: Array | None
 ) -> Array | None:
     if values.box is not None:
         return np.array(values.box)
