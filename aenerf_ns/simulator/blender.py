@@ -11,7 +11,7 @@ import os
 import signal
 import sys
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, Literal, NamedTuple
@@ -320,17 +320,13 @@ def _silence() -> Iterator[None]:
     """Keep the console free from what Blender, and not Python, prints within the context."""
     sys.stdout.flush()
     sys.stderr.flush()
-    kept = [os.dup(stream) for stream in (1, 2)]
-    nowhere = os.open(os.devnull, os.O_WRONLY)
-    for stream in (1, 2):
-        os.dup2(nowhere, stream)
-    os.close(nowhere)
-    try:
+    with open(os.devnull, "wb") as nowhere, ExitStack() as restoring:
+        for stream in (1, 2):
+            original = os.dup(stream)
+            restoring.callback(os.close, original)
+            restoring.callback(os.dup2, original, stream)
+            os.dup2(nowhere.fileno(), stream)
         yield
-    finally:
-        for stream, original in zip((1, 2), kept, strict=True):
-            os.dup2(original, stream)
-            os.close(original)
 
 
 def _require_files(bpy: Any, path: Path) -> None:
