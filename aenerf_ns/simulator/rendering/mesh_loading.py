@@ -392,20 +392,15 @@ def _triangulate_obj(text: str) -> str:
     if not re.search(r"^f(?: +\S+){4}", text, re.MULTILINE):
         return text
     lines = text.split("\n")
-    vertices: list[str] = []
-    polygons: dict[int, list[tuple[int, list[int]]]] = {}
+    positions = np.array([line.split()[1:4] for line in lines if line.startswith("v ")], np.float64)
+    polygons: dict[int, list[tuple[int, list[str]]]] = {}
     for number, line in enumerate(lines):
-        if line.startswith("v "):
-            vertices.append(line)
-        elif line.startswith("f ") and len(names := line.split()[1:]) > 3:
-            corners = [int(name.partition("/")[0]) - 1 for name in names]
-            polygons.setdefault(len(corners), []).append((number, corners))
-    positions = np.array([line.split()[1:4] for line in vertices], np.float64)
+        if line.startswith("f ") and len(names := line.split()[1:]) > 3:
+            polygons.setdefault(len(names), []).append((number, names))
     for rows in polygons.values():
-        corners = positions[np.array([row for _, row in rows])]
+        corners = positions[[[int(name.partition("/")[0]) - 1 for name in names] for _, names in rows]]
         for i in np.flatnonzero(_least_turns(corners) < 0):
-            number = rows[i][0]
-            names = lines[number].split()[1:]
+            number, names = rows[i]
             triangles = (" ".join(names[k] for k in triangle) for triangle in triangulate(corners[i]))
             lines[number] = "\n".join(f"f {triangle}" for triangle in triangles)
     return "\n".join(lines)
