@@ -69,7 +69,7 @@ def light_points(mesh: Mesh) -> LightPoints:
     position_id = position_ids(mesh.vertices)[mesh.faces].reshape(-1)
     order = np.argsort(position_id, kind="stable")
     start = np.searchsorted(position_id[order], np.arange(position_id.max() + 2))
-    corner = np.empty(len(position_id), np.int64)
+    corner = np.full(len(position_id), -1)  # of no group yet
     count = _smooth_parts(start, order, normals, corner)
     towards, back = np.roll(corners, -1, axis=1) - corners, np.roll(corners, 1, axis=1) - corners
     lengths = np.linalg.norm(towards, axis=-1)
@@ -105,24 +105,18 @@ def _smooth_parts(start, order, normals, part):
     count = 0
     for position in range(len(start) - 1):
         corners = order[start[position] : start[position + 1]]
-        for corner in corners:
-            part[corner] = -1
         for first in corners:
             if part[first] >= 0:
                 continue
             part[first] = count
             # Grow the group from face to face.
-            grown = True
-            while grown:
-                grown = False
-                for member in corners:
-                    if part[member] != count:
-                        continue
-                    for other in corners:
-                        cosine = dot(row(normals, member // 3), row(normals, other // 3))
-                        if part[other] < 0 and cosine > _CREASE:
-                            part[other] = count
-                            grown = True
+            members = [first]
+            while members:
+                normal = row(normals, members.pop() // 3)
+                for other in corners:
+                    if part[other] < 0 and dot(normal, row(normals, other // 3)) > _CREASE:
+                        part[other] = count
+                        members.append(other)
             count += 1
     return count
 
