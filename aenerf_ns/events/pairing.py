@@ -169,7 +169,7 @@ class _Table:
         count = self.size if everything or not self.size else int(np.searchsorted(times, times[-1]))
         if count == 0:
             return
-        run, begins = self._by_pixel(count)
+        run, begins = self._by_pixel(count, count)
         # It has no name, so it is gone when the process ends, however the process ends.
         file = tempfile.TemporaryFile(dir=self.folder)  # noqa: SIM115
         # The errors of NumPy's tofile do not say that the disk is full.
@@ -219,16 +219,11 @@ class _Table:
             num_within_refractory_period=refractory,
         )
 
-    def _by_pixel(self, count: int, length: int | None = None) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Return the first events in memory sorted by pixel, then by time, and where those of each pixel begin.
-
-        Args:
-            count: number of events.
-            length: of the array that is returned, if it is longer.
-        """
+    def _by_pixel(self, count: int, length: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Return the first events in memory by pixel, then by time, with zeros behind, and where each pixel begins."""
         counts = np.bincount(pixel_index(self._entries[:count, 1]), minlength=len(self._usable))
         begins = np.concatenate([[0], np.cumsum(counts)])
-        rows = np.empty((count if length is None else length, 2), np.int64)
+        rows = np.empty((length, 2), np.int64)
         _sort_into(self._entries[:count], 0, begins[:-1].copy(), rows)
         rows[count:] = 0
         return rows, begins
