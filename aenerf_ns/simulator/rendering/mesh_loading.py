@@ -51,7 +51,9 @@ def load_mesh(path: Path, y_up: bool, gloss: Mapping[str, Gloss] | None = None) 
         raise DataError(path, f"unknown kind of mesh {path.suffix!r}", f"give one of {', '.join(MESH_SUFFIXES)}")
     content = _read(path)
     try:
-        return _build_mesh(path, content, y_up, gloss or {})
+        # Infinite vertices are refused once the whole mesh is known.
+        with np.errstate(invalid="ignore", over="ignore"):
+            return _build_mesh(path, content, y_up, gloss or {})
     except DataError:
         raise
     except Exception as error:  # a malformed file raises exceptions of any kind in trimesh
@@ -244,9 +246,7 @@ def _build_part(
                 linear = decode(np.arange(256) / 255, "srgb").astype(np.float32)
                 textures[id(image)] = linear[np.asarray(image.convert("RGB"))[::-1]]
             index = list(textures).index(id(image))
-    # Infinite vertices are refused later, where the whole mesh is known.
-    with np.errstate(invalid="ignore", over="ignore"):
-        moved = vertices @ transform[:3, :3].T + transform[:3, 3]
+    moved = vertices @ transform[:3, :3].T + transform[:3, 3]
     if np.linalg.det(transform[:3, :3]) < 0:
         faces = faces[:, ::-1]
     return moved, faces, uv, color, np.full(len(faces), index)
@@ -319,12 +319,10 @@ def _least_turns(corners: Array) -> Array:
 
     A turn is the sine of its angle, times the adjacent sides, times twice the polygon's area.
     """
-    # Infinite vertices are refused later, where the whole mesh is known.
-    with np.errstate(invalid="ignore", over="ignore"):
-        edges = np.roll(corners, -1, axis=1) - corners
-        turns = np.cross(edges, np.roll(edges, -1, axis=1))
-        normals = np.cross(corners, np.roll(corners, -1, axis=1)).sum(axis=1, keepdims=True)
-        return (turns * normals).sum(axis=-1).min(axis=1)
+    edges = np.roll(corners, -1, axis=1) - corners
+    turns = np.cross(edges, np.roll(edges, -1, axis=1))
+    normals = np.cross(corners, np.roll(corners, -1, axis=1)).sum(axis=1, keepdims=True)
+    return (turns * normals).sum(axis=-1).min(axis=1)
 
 
 def _require_plain_ply(path: Path, mesh: Any) -> None:
