@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import torch
@@ -119,17 +119,10 @@ class OwnRecordingDataParser(EventDataParser):
         images = self._image_list
         timed = read_image_list(images) if config.images is not None or images.is_file() else []
         calibration = self._read_calibration(bool(timed))
-        capture = config.make_capture(
-            calibration.sensor,
-            calibration.has_assumed_thresholds,
-            event_file=self._event_file(calibration.event_camera.width, calibration.event_camera.height),
-            event_camera=calibration.event_camera,
-            frame_camera=calibration.frame_camera,
-            image_encoding=config.image_encoding or calibration.image_encoding,
-            intrinsics_origin=calibration.intrinsics_origin,
-            frame_from_event=calibration.frame_from_event,
-        )
-        return capture, timed
+        if config.image_encoding is not None:
+            calibration = replace(calibration, image_encoding=config.image_encoding)
+        events = self._event_file(calibration.event_camera.width, calibration.event_camera.height)
+        return config.make_capture(event_file=events, **vars(calibration)), timed
 
     @property
     def _folder(self) -> Path:
