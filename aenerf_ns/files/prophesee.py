@@ -37,6 +37,7 @@ _MAX_TIMELESS = 1 << 20
 _RECORD = np.dtype([("time", "<u4"), ("address", "<u4")])
 # Records of Event2d and of EventCd have the same fields.
 _EVENT_TYPES = (0x00, 0x0C)
+# Only the lower 32 bits of a time are known: each time is the nearest to its predecessor.
 _LAP = 1 << 32
 # Times that are read to count how often they wrapped. Two neighbors must be less than half a lap, 36 min, apart.
 _MAX_SAMPLES = 10_000
@@ -183,35 +184,20 @@ class PropheseeDatFile(EventFile):
 
     def read_chunks(self) -> Iterator[EventStream]:
         self._require_end()
-        previous = None
+        last = np.zeros(0, np.int64)
         with self.path.open("rb") as file:
             file.seek(self._begin)
             while len(records := np.fromfile(file, _RECORD, CHUNK)):
-                time = _unwrap(records["time"], previous)
-                previous = int(time[-1])
+                time = np.unwrap(np.append(last, records["time"]), period=_LAP)[len(last) :]
+                last = time[-1:]
                 address = records["address"]
                 x, y = ((address >> shift & 0x3FFF).astype(np.uint16) for shift in (0, 14))
                 yield self._stream((x, y, time * 1000, 2 * (address >> 28).astype(np.int8) - 1))
 
     def read_time_span(self) -> tuple[int, int] | None:
         self._require_end()
-        count = self._num_events
-        if count == 0:
+        if self._num_events == 0:
             return None
-        samples = []
-        with self.path.open("rb") as file:
-            for index in (*range(0, count, max(1, count // _MAX_SAMPLES)), count - 1):
-                file.seek(self._begin + index * _RECORD.itemsize)
-                samples.append(np.fromfile(file, _RECORD, 1)["time"])
-        time = _unwrap(np.concatenate(samples), None)
-        return int(time[0]) * 1000, int(time[-1]) * 1000
-
-
-def _unwrap(time: NDArray[np.uint32], previous: int | None) -> NDArray[np.int64]:
-    """Return (N,) microseconds for times whose lower 32 bits alone are known.
-
-    Each time is the nearest to its predecessor. The one before the first is None at the beginning of a file.
-    """
-    begin = int(time[0]) if previous is None else previous
-    steps = np.diff(time.astype(np.int64), prepend=begin)
-    return begin + np.cumsum((steps + _LAP // 2) % _LAP - _LAP // 2)
+        times = np.memmap(self.path, _RECORD, "r", self._begin, (self._num_events,))["time"]
+        samples = np.append(times[:: max(1, len(times) // _MAX_SAMPLES)], times[-1]).astype(np.int64)
+        return int(times[0]) * 1000, int(np.unwrap(samples, period=_LAP)[-1]) * 1000
