@@ -84,7 +84,7 @@ class EventDataset(InputDataset):
         if pairs is None:
             # Several processes read a short recording side by side.
             with file.making(alone=count is None or count > EVENTS_IN_MEMORY):
-                pairs = file.find_newer()
+                pairs = file.find()
                 if pairs is None:
                     read = events.path
                     pairs = pair_events(

@@ -43,13 +43,14 @@ class PairFile:
         options = {name: repr(value) for name, value in vars(events).items() if name not in _NOT_OPTIONS}
         stated = {"version": _VERSION, "files": _stamps(events.path), "reader": options, **made_from}
         self._made_from = json.dumps(stated, sort_keys=True)
+        self._looked_at: list[tuple[str, int, int]] = []
         self._new: BinaryIO | None = None
         self._is_kept = False
 
     def find(self) -> EventPairs | None:
-        """Find the pairs of an earlier run. None, and a line why, if they must be made."""
-        self._looked_at = _stamps(self.path)
-        if not self._looked_at:
+        """Find the pairs that were made since the last look. None, and a line why, if they must be made."""
+        before, self._looked_at = self._looked_at, _stamps(self.path)
+        if self._looked_at in ([], before):
             return None
         try:
             with self.path.open("rb") as file:
@@ -60,10 +61,6 @@ class PairFile:
         if found is None:
             CONSOLE.print(f"{self.path} {problem}: it is made again.", style="yellow", markup=False)
         return found
-
-    def find_newer(self) -> EventPairs | None:
-        """Find the pairs that another process has made since the last look."""
-        return None if _stamps(self.path) == self._looked_at else self.find()
 
     def _read(self, file: BinaryIO) -> EventPairs | None:
         """Read the pairs, None if they are of other events or options.
