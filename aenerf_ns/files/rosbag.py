@@ -13,6 +13,7 @@ from __future__ import annotations
 import re
 import shlex
 import struct
+from collections import deque
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -112,10 +113,8 @@ class RosbagEventFile(EventFile):
 
     @contextmanager
     def _open(self) -> Iterator[rosbag1.Reader | rosbag2.Reader]:
-        from rosbags.rosbag1 import Reader as Ros1Reader
-        from rosbags.rosbag1 import ReaderError as Ros1ReaderError
-        from rosbags.rosbag2 import Reader as Ros2Reader
-        from rosbags.rosbag2 import ReaderError as Ros2ReaderError
+        import rosbags.rosbag1 as rosbag1
+        import rosbags.rosbag2 as rosbag2
 
         is_mcap = self.path.is_file() and _begins(self.path, _MCAP_MAGIC)
         if self.path.is_dir():
@@ -130,9 +129,9 @@ class RosbagEventFile(EventFile):
                     problem = "it has no index, as if interrupted"
                     raise DataError(self.path, problem, f"rosbag reindex {shlex.quote(str(self.path))}")
         try:
-            with Ros2Reader(self.path) if self._is_ros2 else Ros1Reader(self.path) as reader:
+            with rosbag2.Reader(self.path) if self._is_ros2 else rosbag1.Reader(self.path) as reader:
                 yield reader
-        except (Ros1ReaderError, Ros2ReaderError) as error:
+        except (rosbag1.ReaderError, rosbag2.ReaderError) as error:
             if self._is_ros2 and not is_mcap:
                 raise
             # A recording that was interrupted lacks its end.
@@ -227,11 +226,8 @@ class RosbagEventFile(EventFile):
         with self._open() as bag:
             starts = [*(bag.end_time - seconds * 1_000_000_000 for seconds in _TAIL_SECONDS), None]
         for start in starts:
-            end = None
-            for _, _, t, _ in self._columns(start):
-                end = int(t[-1])
-            if end is not None:
-                return int(first[2][0]), end
+            if last := deque(self._columns(start), maxlen=1):
+                return int(first[2][0]), int(last[0][2][-1])
         return None
 
 
