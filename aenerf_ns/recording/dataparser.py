@@ -179,15 +179,11 @@ class EventDataParser(DataParser):
         camera = recording.event_camera if split == "train" else recording.frame_camera
         if split == "train":
             times, images = viewer_cameras(trajectory, recording.reference_views["train"])
-            for file in images.values():
-                check_image(file, recording.frame_camera)
             cameras = camera.cameras(trajectory.interpolate(times))
             cameras.metadata[TRAJECTORY_SECONDS] = trajectory.seconds(times)[:, None]
             frames = _frames(recording, window)
         else:
             views = thin_views(views_within(recording.reference_views[split], window), recording.max_views)
-            for view in views:
-                check_image(view.file, recording.frame_camera)
             poses = torch.stack([v.camera_to_world for v in views]) if views else torch.zeros(0, 4, 4).double()
             poses = to_scene(poses)
             _check_distance(poses, trajectory if ground_truth is None else ground_truth)
@@ -195,6 +191,8 @@ class EventDataParser(DataParser):
             cameras.metadata[REFERENCE_SECONDS] = seconds_on_trajectory(views, trajectory)
             times, images = torch.zeros(0, dtype=torch.int64), {i: view.file for i, view in enumerate(views)}
             frames = ()
+        for file in images.values():
+            check_image(file, recording.frame_camera)
         # Nerfstudio wants a file name for every camera, also for one without an image.
         names = [images.get(index, self.data / f"camera_{index:05d}") for index in range(len(cameras))]
         scene = SceneRecording(
