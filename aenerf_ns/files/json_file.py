@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import json
 import re
-from decimal import Decimal
+from decimal import Context, Decimal
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -98,11 +98,9 @@ def _convert_other(kind: type, value: Any) -> Any:
 
 
 def _parse_decimal(text: str) -> Decimal:
-    try:
-        value = Decimal(text)
-    except ArithmeticError:
-        value = None
-    if value is None or not value.is_finite() or value.adjusted() > _MAX_EXPONENT:
+    # Without traps, a number that is too large for Decimal is NaN.
+    value = Decimal(text, Context(traps=[]))
+    if not value.is_finite() or value.adjusted() > _MAX_EXPONENT:
         raise ValueError(f"the number {text[:40]} is too large, or not finite")
     return value
 
