@@ -30,7 +30,8 @@ class EventLayout:
     Attributes:
         columns: for x, y, t and p the name of an array and the part of it: None for an array of numbers, the index of a
             column for a matrix, or the name of a field for an array of records.
-        time_unit: of the times, or None for the rule of :func:`guess_time_unit` where the file states none.
+        time_unit: of the times, or None where the file states it or it is guessed: whole numbers are microseconds,
+            which event cameras count, and decimals seconds.
         time_offset: name of a number that is added to all times, in their unit, where there is one.
     """
 
@@ -123,20 +124,15 @@ class EventTableFile(EventFile):
         if unit := self._given_unit or self._layout.time_unit:
             return unit
         ends = ((0, SAMPLE), (max(self._length(arrays) - SAMPLE, 0), None))
-        return guess_time_unit(np.concatenate([self._columns(arrays, *end)["t"] for end in ends]))
+        times = np.concatenate([self._columns(arrays, *end)["t"] for end in ends])
+        return "s" if times.dtype.kind == "f" and (times > np.floor(times)).any() else "us"
 
     def _tick(self, arrays: Mapping[str, Any]) -> int:
-        """Return the nanoseconds of the unit of the times."""
         return NANOSECONDS[self._stated_unit(arrays) or self._unit_of_format(arrays)]
 
     def _read(self, arrays: Mapping[str, Any], first: int, last: int, tick: int) -> EventStream:
         columns, offset = self._columns(arrays, first, last), arrays.get("time_offset", 0)
         return self._stream(events_from_columns(self, columns, tick, lambda index: f"event {first + index}", offset))
-
-
-def guess_time_unit(times: NDArray) -> TimeUnit:
-    """Return microseconds, which event cameras count, for whole numbers, and seconds for decimals."""
-    return "s" if times.dtype.kind == "f" and (times > np.floor(times)).any() else "us"
 
 
 def events_from_columns(
