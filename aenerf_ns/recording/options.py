@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, ClassVar, Literal
 
@@ -58,15 +58,14 @@ class EventDataParserConfig(DataParserConfig):
             DataError: a whole number among the options is beyond all times, or the longest gap or the scale is not
                 positive.
         """
-        values = {option.name: getattr(self, option.name) for option in fields(self)}
-        for option, value in values.items():
+        for option, value in vars(self).items():
             problem = f"--{option.replace('_', '-')} is {value}"
             if isinstance(value, int) and abs(value) > MAX_TIME:
                 raise DataError(str(self.data), problem, "give nanoseconds, which have 19 digits at most")
             if option in ("max_pose_gap_ns", "scale_factor") and value is not None and not 0 < value < float("inf"):
                 raise DataError(str(self.data), problem, "give a positive number")
         # A run's saved configuration is also read in other working directories.
-        paths = {option: value.absolute() for option, value in values.items() if isinstance(value, Path)}
+        paths = {option: value.absolute() for option, value in vars(self).items() if isinstance(value, Path)}
         return super(EventDataParserConfig, replace(self, **paths)).setup(**kwargs)  # type: ignore[arg-type]
 
 
