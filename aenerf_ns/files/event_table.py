@@ -183,8 +183,8 @@ def events_from_columns(
 
     times, polarities = columns["t"], columns["p"]
     limit = MAX_TIME // tick - abs(offset)
-    # NaN compares as false; no time is good where the offset alone is beyond the limit.
-    good = (times >= -limit) & (times <= limit) if times.dtype.kind in "if" else (limit >= 0) & (times <= max(limit, 0))
+    # NaN compares as false, and no time is good where the offset alone is beyond the limit.
+    good = (times >= -limit) & (times <= limit)
     unit = "the unit of the times (--event-time-unit of event-recording-data)"
     require("t", good, f"check {unit} and the order of the columns")
 
