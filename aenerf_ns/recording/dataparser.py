@@ -181,7 +181,6 @@ class EventDataParser(DataParser):
             times, images = viewer_cameras(trajectory, recording.reference_views["train"])
             cameras = camera.cameras(trajectory.interpolate(times))
             cameras.metadata[TRAJECTORY_SECONDS] = trajectory.seconds(times)[:, None]
-            frames = _frames(recording, window)
         else:
             views = thin_views(views_within(recording.reference_views[split], window), recording.max_views)
             poses = torch.stack([v.camera_to_world for v in views]) if views else torch.zeros(0, 4, 4).double()
@@ -190,7 +189,6 @@ class EventDataParser(DataParser):
             cameras = camera.cameras(poses)
             cameras.metadata[REFERENCE_SECONDS] = seconds_on_trajectory(views, trajectory)
             times, images = torch.zeros(0, dtype=torch.int64), {i: view.file for i, view in enumerate(views)}
-            frames = ()
         for file in images.values():
             check_image(file, recording.frame_camera)
         # Nerfstudio wants a file name for every camera, also for one without an image.
@@ -208,7 +206,7 @@ class EventDataParser(DataParser):
             has_image=[index in images for index in range(len(cameras))],
             image_encoding=recording.image_encoding,
             bounded=recording.scene_box is not None,
-            frames=frames,
+            frames=_frames(recording, window) if split == "train" else (),
             is_whole=self.config.start_time_ns is None and self.config.end_time_ns is None,
         )
         return DataparserOutputs(
