@@ -127,15 +127,16 @@ def test_clock_remedy_names_the_learning_option() -> None:
         assert option is None or option in remedy
 
 
-def run(folder: Path, **options: Any) -> tuple[int, str]:
-    """Return the exit status of the check, and its output."""
-    status = 0
+def run(folder: Path, *, status: int | None = None, **options: Any) -> str:
+    """Return the output of the check. It must end with an exit status, if one is given."""
+    ended = 0
     with CONSOLE.capture() as output:
         try:
             Check(folder, **options).main()
         except SystemExit as end:
-            status = int(end.code or 0)
-    return status, output.get()
+            ended = int(end.code or 0)
+    assert status in (None, ended), output.get()
+    return output.get()
 
 
 # What is left of each column is that of the recording. To permute all but the times is to permute the times.
@@ -144,15 +145,13 @@ def test_reject_noise(columns: str, shorter: Path) -> None:
     events = all_events(open_native(shorter))
     order = np.random.default_rng(0).permutation(len(events))
     rewrite(shorter, replace(events, **{name: getattr(events, name)[order] for name in columns}))
-    status, output = run(shorter)
-    assert status == 1, output
+    output = run(shorter, status=1)
     assert "hardly sharper than the same events in a random order" in output
 
 
 def test_reject_poses_of_another_path(shorter: Path) -> None:
     change_poses(shorter, lambda poses: poses.flip(0))
-    status, output = run(shorter)
-    assert status == 1, output
+    run(shorter, status=1)
 
 
 @pytest.fixture
@@ -180,8 +179,7 @@ OPTION = "guess, give the format --positive-contrast-threshold "
 def test_command_finds_nothing_and_draws_a_picture(shorter: Path, tmp_path: Path) -> None:
     set_in("transforms.json", "scene_box", value=[[-8.0] * 3, [8.0] * 3])(shorter)
     set_in("transforms.json", "event_camera", "positive_contrast_threshold", value=0.4)(shorter)
-    status, output = run(shorter, picture=tmp_path / "warped.png")
-    assert status == 0, output
+    output = run(shorter, status=0, picture=tmp_path / "warped.png")
     assert "No problems found" in output
     count = len(all_events(open_native(shorter)))
     assert f"Events: {count:,} in 1." in output
@@ -203,8 +201,7 @@ def test_command_names_reversed_polarities_and_a_small_scene_box(shorter: Path) 
     rewrite(shorter, replace(events, p=-events.p))
     set_in("transforms.json", "scene_box", value=[[-0.5] * 3, [0.5] * 3])(shorter)
     set_in("transforms.json", "event_camera", "positive_contrast_threshold", value=0.4)(shorter)
-    status, output = run(shorter)
-    assert status == 1
+    output = run(shorter, status=1)
     assert "the scene box holds only" in output
     assert "change from frame to frame: -0.9" in output
     assert "the polarities look reversed" in output
@@ -225,8 +222,7 @@ def test_command_names_mistakes_and_remedies(room: Path, shorter: Path) -> None:
     p = np.append(events.p, np.ones(6000, np.int8))
     whole_milliseconds = t[order] // 1_000_000 * 1_000_000
     rewrite(shorter, EventStream(x[order], y[order], whole_milliseconds, p[order], 64, 48))
-    status, output = run(shorter)
-    assert status == 1
+    output = run(shorter, status=1)
     assert "all times of events are whole milliseconds" in output
     assert "as if the poses are world-to-camera" in output
     assert "invert each" in output
@@ -243,8 +239,7 @@ def test_command_reports_gaps_and_missing_poses(shorter: Path) -> None:
     events = all_events(open_native(shorter))
     one = np.ones(len(events), np.int8)
     rewrite(shorter, EventStream(events.x, events.y, events.t, one, 64, 48))
-    status, output = run(shorter)
-    assert status == 1
+    output = run(shorter, status=1)
     assert "Gaps between poses: 1" in output
     assert "of the events fall in gaps" in output
     assert "of the events have a pose, the others are not used" in output
@@ -274,16 +269,16 @@ def test_a_gap_between_joined_recordings_is_a_problem(tmp_path: Path) -> None:
     write_calibration(tmp_path / "calibration.json")
     write_poses(tmp_path / "trajectory.txt", seconds=10.0)
     # A camera that stands still has poses.
-    assert "gaps between poses" not in run(tmp_path)[1]
+    assert "gaps between poses" not in run(tmp_path)
     lines = (tmp_path / "trajectory.txt").read_text().splitlines(keepends=True)
     (tmp_path / "trajectory.txt").write_text("".join(lines[:101] + lines[900:]))
-    assert "80.0% of the time is in gaps between poses without events" in run(tmp_path)[1]
-    assert "gaps between poses" not in run(tmp_path, format_options=("max-pose-gap-ns=100000000",))[1]
+    assert "80.0% of the time is in gaps between poses without events" in run(tmp_path)
+    assert "gaps between poses" not in run(tmp_path, format_options=("max-pose-gap-ns=100000000",))
     # Nor is a rest a problem, in which poses from events have a gap.
     poses = [line.split(maxsplit=1)[1] for line in lines[101:202]]
     later = [f"{line.split()[0]} {pose}" for line, pose in zip(lines[900:], poses, strict=True)]
     (tmp_path / "trajectory.txt").write_text("".join(lines[:101] + later))
-    assert "gaps between poses" not in run(tmp_path)[1]
+    assert "gaps between poses" not in run(tmp_path)
 
 
 def test_a_chosen_time_window_is_no_lack_of_poses(tmp_path: Path) -> None:
@@ -291,7 +286,7 @@ def test_a_chosen_time_window_is_no_lack_of_poses(tmp_path: Path) -> None:
     write_calibration(tmp_path / "calibration.json")
     write_poses(tmp_path / "trajectory.txt", seconds=10.0)
     window = "start-time-ns=2000000000", "end-time-ns=4000000000"
-    output = run(tmp_path, format_options=window)[1]
+    output = run(tmp_path, format_options=window)
     assert "Events with a pose: 100.0%" in output
     assert "the others are not used" not in output
     # Nor is what is wrong with the poses of other times a problem.
@@ -300,13 +295,13 @@ def test_a_chosen_time_window_is_no_lack_of_poses(tmp_path: Path) -> None:
     (tmp_path / "trajectory.txt").write_text("".join(lines[:50] + lines[150:600] + still + lines[800:]))
     problems = "of the events fall in gaps", "of the events fall between poses that are equal"
     for options in ((), window):
-        output = run(tmp_path, format_options=options)[1]
+        output = run(tmp_path, format_options=options)
         assert [problem in output for problem in problems] == [not options] * 2
 
 
 def test_few_events_are_not_warped(native: Path, tmp_path: Path) -> None:
     picture = tmp_path / "warped.png"
-    _, output = run(native, picture=picture)
+    output = run(native, picture=picture)
     assert "Contrast of warped events: not computed, because no 2000 events have poses without" in output
     assert f"{picture}: not written" in output
     assert not picture.exists()
@@ -318,8 +313,7 @@ def test_the_events_of_a_bare_file_are_checked(room: Path, tmp_path: Path) -> No
     camera = json.loads((room / "transforms.json").read_text())["event_camera"]
     (tmp_path / "calibration.json").write_text(json.dumps({"event_camera": camera}))
     options = ("negative-contrast-threshold=0.5", "scale-factor=2", "start-time-ns=1")
-    status, output = run(file, format_options=options, picture=tmp_path / "no.png")
-    assert status == 0, output
+    output = run(file, status=0, format_options=options, picture=tmp_path / "no.png")
     assert "Events: " in output
     assert "no.png: not written" in output
     command = (
@@ -329,11 +323,10 @@ def test_the_events_of_a_bare_file_are_checked(room: Path, tmp_path: Path) -> No
     # The files beside the event file are parts of the recording.
     swapped = {**camera, "cx": camera["cy"], "cy": camera["cx"]}
     (tmp_path / "calibration.json").write_text(json.dumps({"event_camera": swapped}))
-    status, output = run(file)
-    assert status == 1
+    output = run(file, status=1)
     assert "x and y swapped" in output
     shutil.copy(room / "trajectory_estimated.txt", tmp_path / "trajectory.txt")
-    assert "Events with a pose: 100.0%" in run(file)[1]
+    assert "Events with a pose: 100.0%" in run(file)
 
 
 def number_after(words: str, output: str) -> float:
@@ -345,12 +338,11 @@ def test_real_recording_prefers_its_poses_and_is_compared_with_frames(
 ) -> None:
     compare, found = WarpedEvents.compare_alternatives, []
     monkeypatch.setattr(WarpedEvents, "compare_alternatives", lambda warped: found.extend(compare(warped)) or found)
-    status, output = run(slider_depth, picture=tmp_path / "warped.png")
+    # The poses sharpen the events, and no alternative fits better.
+    output = run(slider_depth, status=0, picture=tmp_path / "warped.png")
     # Twice 240 x 180, twice enlarged: its tiles reach beyond the sensor.
     with Image.open(tmp_path / "warped.png") as picture:
         assert picture.size == (960, 360)
-    # So the poses sharpen the events, and no alternative fits better.
-    assert status == 0, output
     # The camera moves along its x axis and does not turn, so that mistakes that keep this axis do not show.
     unseen = {"the poses have OpenGL camera axes (y up, z backward)", "the pixels are mirrored in y"}
     of = {comparison.hypothesis.name: comparison for comparison in found}
@@ -389,7 +381,7 @@ def test_the_last_digit_of_poses_at_rest_is_no_jump(shorter: Path) -> None:
         return moved
 
     change_poses(shorter, drift)
-    assert "the poses jump" not in run(shorter)[1]
+    assert "the poses jump" not in run(shorter)
 
 
 @pytest.mark.parametrize(
@@ -407,8 +399,7 @@ def test_wrong_poses_in_places_are_no_wrong_axes(part: slice, stuck: bool, probl
         return poses
 
     change_poses(shorter, change)
-    status, output = run(shorter)
-    assert status == 1
+    output = run(shorter, status=1)
     assert problem in output
     assert "as if" not in output.split("problem")[-1]
     assert "the contrast does not tell whether poses, lens and clock are right" in output
@@ -430,16 +421,14 @@ def test_wrong_poses_in_places_are_no_wrong_axes(part: slice, stuck: bool, probl
 )
 def test_a_lens_of_another_size_is_no_wrong_axes(changes: dict, problems: list[str], shorter: Path) -> None:
     edit_json("transforms.json", lambda meta: meta["event_camera"].update(changes))(shorter)
-    status, output = run(shorter)
-    assert status == 1
+    output = run(shorter, status=1)
     assert all(problem in output for problem in problems)
     assert "as if" not in output.split("problem")[-1]
 
 
 def test_a_part_of_the_sensor_may_have_its_principal_point_anywhere(shorter: Path, tmp_path: Path) -> None:
     Convert(shorter, tmp_path / "part", region=(0, 0, 64, 24)).main()
-    status, output = run(tmp_path / "part")
-    assert status == 0, output
+    output = run(tmp_path / "part", status=0)
     assert "principal point" not in output
     assert "--pipeline.model.near-plane" in output
 
@@ -448,8 +437,7 @@ def test_a_lens_that_ends_before_the_events_is_named(shorter: Path) -> None:
     events = all_events(open_native(shorter))
     rewrite(shorter, events[events.x < 12])
     edit_json("transforms.json", lambda meta: meta["event_camera"].update(k1=-20.0))(shorter)
-    status, output = run(shorter)
-    assert status == 1
+    output = run(shorter, status=1)
     assert "the lens gives no direction to the pixels of nearly all events" in output
 
 
@@ -458,7 +446,7 @@ def test_one_slice_gives_no_verdict(room: Path, tmp_path: Path) -> None:
     rewrite(folder, all_events(open_native(folder))[:3500])
     change_poses(folder, lambda poses: poses @ OPENCV_TO_OPENGL)
     set_in("transforms.json", "scene_box", value=[[-0.5] * 3, [0.5] * 3])(folder)
-    _, output = run(folder)
+    output = run(folder)
     assert "as if" not in output.split("problem")[-1]
     assert "the scene box holds only" not in output
     assert "Within the scene box: " in output
