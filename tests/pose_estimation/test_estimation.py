@@ -6,6 +6,7 @@ import json
 import shutil
 import sqlite3
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -102,53 +103,47 @@ def test_colmap_finds_simulated_poses(dataset: Path) -> None:
 
 
 @pytest.fixture(scope="module")
-def video(room: SimulationScene) -> tuple[Simulation, np.ndarray, list[np.ndarray]]:
+def video(room: SimulationScene) -> SimpleNamespace:
+    """14 frames with their camera, times in nanoseconds and true poses."""
     camera = CameraIntrinsics(160, 120, *room.intrinsics(160, 120))
     simulation = Simulation(room, camera, SensorModel(), "easy", 14 / 25 - 0.03, 2.0, 0)
     times = simulation.frame_times(25.0, 0.003)
-    return simulation, times, [simulation.blurred_frame(int(time), 0.003) for time in times]
-
-
-def test_adjustment_reduces_errors(
-    video: tuple[Simulation, np.ndarray, list[np.ndarray]], room: SimulationScene
-) -> None:
-    simulation, times, frames = video
-    camera = CameraIntrinsics(160, 120, *room.intrinsics(160, 120))
+    frames = [simulation.blurred_frame(int(time), 0.003) for time in times]
     truth = torch.stack([simulation.pose(int(time))[:3] for time in times])
+    return SimpleNamespace(camera=camera, times=times, frames=frames, truth=truth)
+
+
+def test_adjustment_reduces_errors(video: SimpleNamespace) -> None:
     errors = []
     for adjusted in (False, True):
-        found = estimate_poses(frames, times, camera, "frames", adjusted=adjusted)
-        errors.append(compare_with_truth(found.trajectory, truth)[1]["rotation_error_degrees"])
+        found = estimate_poses(video.frames, video.times, video.camera, "frames", adjusted=adjusted)
+        errors.append(compare_with_truth(found.trajectory, video.truth)[1]["rotation_error_degrees"])
         assert ("mapper; " in found.summary()) == adjusted
     # Measured: 0.25 and 0.11 degrees.
     assert errors[1] < 0.6 * errors[0]
 
 
-def test_colmap_estimates_intrinsics(
-    video: tuple[Simulation, np.ndarray, list[np.ndarray]], room: SimulationScene
-) -> None:
-    _, times, frames = video
-    found = estimate_poses(frames, times, (160, 120), "frames")
-    assert len(found.trajectory) == len(frames)
-    assert found.camera.fx == found.camera.fy == pytest.approx(room.intrinsics(160, 120)[0], rel=0.05)
+def test_colmap_estimates_intrinsics(video: SimpleNamespace) -> None:
+    found = estimate_poses(video.frames, video.times, (160, 120), "frames")
+    assert len(found.trajectory) == len(video.frames)
+    assert found.camera.fx == found.camera.fy == pytest.approx(video.camera.fx, rel=0.05)
     assert (found.camera.cx, found.camera.cy) == (80, 60)
     assert abs(found.camera.distortion[0]) < 0.05
     assert found.camera.distortion[1:] == (0.0,) * 4
 
 
 def test_a_lens_is_kept_where_an_adjustment_of_it_fails(
-    video: tuple[Simulation, np.ndarray, list[np.ndarray]], room: SimulationScene, monkeypatch: pytest.MonkeyPatch
+    video: SimpleNamespace, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    _, times, frames = video
     adjust = ColmapWorkspace.adjust
 
     def fail(workspace: ColmapWorkspace, *limits: Any, refine_intrinsics: bool = False) -> Any:
         return pycolmap.Reconstruction() if refine_intrinsics else adjust(workspace, *limits)
 
     monkeypatch.setattr(ColmapWorkspace, "adjust", fail)
-    found = estimate_poses(frames[:8], times[:8], (160, 120), "frames")
+    found = estimate_poses(video.frames[:8], video.times[:8], (160, 120), "frames")
     assert len(found.trajectory) == 8
-    assert found.camera.fx == pytest.approx(room.intrinsics(160, 120)[0], rel=0.2)
+    assert found.camera.fx == pytest.approx(video.camera.fx, rel=0.2)
 
 
 @pytest.fixture(scope="module")
