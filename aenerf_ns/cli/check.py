@@ -35,21 +35,11 @@ class Check(DatasetCommand):
     """Exit status for a dataset that cannot be read."""
 
     def main(self) -> None:
-        """Print what is found, and end the process with status 1 if there are problems."""
+        """Print what is found, write the picture, and end the process with status 1 if there are problems."""
         if self.picture is not None:
             if self.picture.suffix.lower() not in _IMAGE_SUFFIXES:
                 raise DataError(self.picture, "not the name of a picture", "end the --picture with .png")
             require_writable(self.picture, "--picture")
-        problems = self._find_problems()
-        if problems:
-            say(f"\n{len(problems)} {'problem' if len(problems) == 1 else 'problems'}:")
-            for problem in problems:
-                say(f"  - {problem}")
-            sys.exit(1)
-        say("\nNo problems found.")
-
-    def _find_problems(self) -> list[str]:
-        """Print the figures, write the picture and return the problems."""
         parser = self.open_dataset()
         from PIL import Image
 
@@ -76,7 +66,12 @@ class Check(DatasetCommand):
             say(f"{self.picture}: events as they came, and warped")
         elif self.picture is not None:
             say(f"{self.picture}: not written, because too few events have a pose")
-        return result.problems
+        if result.problems:
+            say(f"\n{len(result.problems)} {'problem' if len(result.problems) == 1 else 'problems'}:")
+            for problem in result.problems:
+                say(f"  - {problem}")
+            sys.exit(1)
+        say("\nNo problems found.")
 
     def _say_training_command(self, parser: EventDataParser, result: CheckResult) -> None:
         format_words: list[str] = []
