@@ -32,15 +32,13 @@ def evaluate(run: TrainedRun, output: Path | None = None, with_deviations: bool 
     Raises:
         DataError: there are neither views nor true poses, or the model renders values that are not finite.
     """
-    model = run.model
-    correction, supervision = model.camera_optimizer, model.supervision
+    model, correction = run.model, run.model.camera_optimizer
     metrics: dict[str, Any] = {}
     placed: list[dict[str, float]] = []
     refined = None
     if run.views is not None or not correction.has_ground_truth:
         placed = measure_reference_views(run, output)
-        metrics = average_metrics(placed, with_deviations)
-        _require_finite(metrics, run)
+        metrics = _finite_means(run, placed, with_deviations)
     metrics["color_correction"] = model.color_correction.description
     if isinstance(model.color_correction, AffineColorCorrection):
         metrics["color_correction_slope"] = model.color_correction.scale.tolist()
@@ -52,29 +50,24 @@ def evaluate(run: TrainedRun, output: Path | None = None, with_deviations: bool 
     metrics["test_poses"] = describe_test_poses(correction)
     if placed and run.refine_test_poses:
         refined = measure_reference_views(run, refine=True)
-        metrics["refined_test_poses"] = _describe_refined(run, refined, with_deviations)
-    metrics |= supervision.learned_values()
+        means = _finite_means(run, refined, with_deviations)
+        protocol = f"photometric refinement, {NUM_STEPS} Levenberg-Marquardt steps, from: {metrics['test_poses']}"
+        metrics["refined_test_poses"] = {
+            # The time to render includes no refinement, so it says nothing new.
+            **{name: value for name, value in means.items() if name.removesuffix("_std") in IMAGE_METRICS},
+            **({} if model.image_metrics.lpips_absent is None else {"lpips": None}),
+            "test_poses": protocol,
+        }
+    metrics |= model.supervision.learned_values()
     if model.image_metrics.lpips_absent is not None:
-        metrics["lpips"] = None
-        metrics["lpips_absent"] = model.image_metrics.lpips_absent
+        metrics |= {"lpips": None, "lpips_absent": model.image_metrics.lpips_absent}
     metrics["views"] = describe_views(run, placed, refined) if placed else []
     return metrics
 
 
-def _describe_refined(run: TrainedRun, refined: Sequence[dict[str, float]], with_deviations: bool) -> dict[str, Any]:
-    """Return the mean metrics of the reference views from refined poses, and how the poses were refined."""
-    metrics: dict[str, Any] = average_metrics(refined, with_deviations)
-    _require_finite(metrics, run)
-    # The time to render includes no refinement, so it says nothing new.
-    metrics = {name: value for name, value in metrics.items() if name.removesuffix("_std") in IMAGE_METRICS}
-    if run.model.image_metrics.lpips_absent is not None:
-        metrics["lpips"] = None
-    start = describe_test_poses(run.model.camera_optimizer)
-    return {**metrics, "test_poses": f"photometric refinement, {NUM_STEPS} Levenberg-Marquardt steps, from: {start}"}
-
-
-def _require_finite(metrics: dict[str, float], run: TrainedRun) -> None:
-    """Raise a DataError if a metric is not a number."""
+def _finite_means(run: TrainedRun, measured: Sequence[dict[str, float]], with_deviations: bool) -> dict[str, Any]:
+    """Return the means of the metrics of views, or raise a DataError if one is not a number."""
+    metrics = average_metrics(measured, with_deviations)
     undefined = [name for name, value in metrics.items() if math.isnan(value)]
     if undefined:
         raise DataError(
@@ -82,3 +75,4 @@ def _require_finite(metrics: dict[str, float], run: TrainedRun) -> None:
             f"{', '.join(undefined)} of the test views is not a number: the model renders values that are not finite",
             "train it again",
         )
+    return metrics
