@@ -115,14 +115,12 @@ class Simulate(SimulationCommand):
             if writer.events.num_events == 0:
                 remedy = "give lower thresholds, or a scene with more contrast"
                 raise DataError(self.scene, "no pixel changes by a contrast threshold", remedy)
-            for time in np.linspace(estimated.start, estimated.end, self.train_images, dtype=np.int64).tolist():
-                pose = simulation.pose(time)
+            times = np.linspace(estimated.start, estimated.end, self.train_images, dtype=np.int64).tolist()
+            views: list[tuple[Split, torch.Tensor, int | None]] = [("train", simulation.pose(t), t) for t in times]
+            views += [(split, pose, None) for split, poses in held_out.items() for pose in poses]
+            for split, pose, time in views:
                 seen = simulation.reference_picture(pose)
-                writer.add_image("train", seen.display, pose, time, linear=seen.linear, depth=seen.depth)
-            for split, poses in held_out.items():
-                for pose in poses:
-                    seen = simulation.reference_picture(pose)
-                    writer.add_image(split, seen.display, pose, linear=seen.linear, depth=seen.depth)
+                writer.add_image(split, seen.display, pose, time, linear=seen.linear, depth=seen.depth)
         if simulator.num_lost_events:
             say(simulator.readout_note())
         say(

@@ -144,9 +144,7 @@ class SimulateVideo(SimulationCommand):
             assert camera is not None
             given = read_tum_trajectory(self.trajectory)
             given.crop(int(video.times[0]), int(video.times[-1]))
-            if not any(self.pose_noise):
-                return _VideoPoses(camera, given)
-            return _VideoPoses(camera, self.add_pose_noise(given), given)
+            return _VideoPoses(camera, self.add_pose_noise(given), given if any(self.pose_noise) else None)
         if self.poses == "colmap":
             lens = (video.width, video.height) if camera is None else camera
             found = estimate_poses(video, video.times, lens, video.source, self.seed)
