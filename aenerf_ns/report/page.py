@@ -13,7 +13,7 @@ import numpy as np
 import plotly.graph_objects as go
 from markupsafe import Markup
 from numpy.typing import NDArray
-from PIL import Image
+from PIL import Image, ImageOps
 from plotly.offline import get_plotlyjs
 
 from aenerf_ns.report import plots, sections
@@ -79,9 +79,8 @@ def _plot(figure: go.Figure | None, otherwise: str = "") -> Markup:
 def _picture(values: Image.Image | NDArray[np.uint8], max_width: int = _MAX_WIDTH) -> str:
     """Encode a picture as a data URL."""
     image = Image.fromarray(values) if isinstance(values, np.ndarray) else values
-    if image.width > max_width:
-        size = max_width, round(image.height * max_width / image.width)
-        image = image.resize(size, Image.Resampling.LANCZOS)
+    # Smaller pictures keep their size.
+    image = ImageOps.contain(image, (max_width, image.height), Image.Resampling.LANCZOS)
     buffer = io.BytesIO()
     image.save(buffer, "JPEG", quality=_QUALITY)
     return f"data:image/jpeg;base64,{base64.b64encode(buffer.getvalue()).decode()}"

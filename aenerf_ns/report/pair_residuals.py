@@ -58,7 +58,7 @@ def measure_pair_residuals(run: TrainedRun) -> PairResiduals | None:
     if drawn is None:
         return None
     rays, batch = drawn
-    at_events = ~batch.ends_between_events.cpu().numpy()
+    at_events = ~batch.ends_between_events
     if not at_events.any():
         return None
     supervision = run.model.supervision
@@ -66,17 +66,15 @@ def measure_pair_residuals(run: TrainedRun) -> PairResiduals | None:
     num_pairs = len(batch)
     log_radiances = []
     chunk = max(run.model.config.eval_num_rays_per_chunk // 2, 1)
-    for begin in range(0, num_pairs, chunk):
-        chosen = torch.arange(begin, min(begin + chunk, num_pairs), device=run.device)
+    for chosen in torch.arange(num_pairs, device=run.device).split(chunk):
         outputs = run.model(rays[torch.cat([chosen, chosen + num_pairs])])
         log_radiances.append(outputs["log_radiance"].unflatten(0, (2, -1)))
+    # All pairs at once: the lag of slow pixels rests on the mean radiance of the others.
     outputs["log_radiance"] = torch.cat(log_radiances, 1).flatten(0, 1)
-    unit = supervision.loss_unit(outputs)
-    changes = torch.stack([change / unit for change in supervision.changes(outputs, batch)])
-    rendered, measured = changes.double().cpu().numpy()
-    length = (batch.num_positive + batch.num_negative).floor().cpu().numpy()[at_events]
-    pixel = batch.pixel.cpu().numpy()[at_events]
-    rendered, measured = rendered[at_events], measured[at_events]
+    changes = torch.stack(supervision.changes(outputs, batch)) / supervision.loss_unit(outputs)
+    rendered, measured = changes[:, at_events].double().cpu().numpy()
+    batch = batch[at_events]
+    length = (batch.num_positive + batch.num_negative).floor().cpu().numpy()
     residual = np.abs(rendered - measured)
     edges, histogram = _histogram(measured, rendered)
     varies = min(np.ptp(measured), np.ptp(rendered)) > 0
@@ -88,16 +86,14 @@ def measure_pair_residuals(run: TrainedRun) -> PairResiduals | None:
         correlation=float(np.corrcoef(measured, rendered)[0, 1]) if varies else None,
         mean_residual=float(residual.mean()),
         by_length=average_by_length(length, residual),
-        by_tile=average_by_tile(pixel, residual, camera.width, camera.height),
+        by_tile=average_by_tile(batch.pixel.cpu().numpy(), residual, camera.width, camera.height),
     )
 
 
 def _histogram(measured: NDArray[np.float64], rendered: NDArray[np.float64]) -> tuple[list[float], list[list[int]]]:
-    both = np.concatenate([measured, rendered])
-    end = float(np.abs(np.quantile(both, [_MAX_BEYOND, 1 - _MAX_BEYOND])).max())
-    edges = np.linspace(-end, end, _BINS + 1)
-    ends = [(-end, end), (-end, end)]
-    counts, _, _ = np.histogram2d(np.clip(rendered, -end, end), np.clip(measured, -end, end), bins=_BINS, range=ends)
+    end = float(np.abs(np.quantile([measured, rendered], [_MAX_BEYOND, 1 - _MAX_BEYOND])).max())
+    rows, columns = np.clip([rendered, measured], -end, end)
+    counts, edges, _ = np.histogram2d(rows, columns, bins=_BINS, range=[(-end, end)] * 2)
     return edges.tolist(), counts.astype(int).tolist()
 
 

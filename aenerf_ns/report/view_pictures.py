@@ -83,10 +83,8 @@ def picture_views(run: TrainedRun, indices: Sequence[int]) -> tuple[list[ViewPic
 def _pictures(outputs: dict[str, Any], truth: torch.Tensor, scale: float) -> ViewPictures:
     rendering, depth = outputs["rgb"], outputs["depth"] / scale
     error = (rendering - truth).abs().mean(-1, keepdim=True)
-    # torch.quantile takes at most 2^24 values.
-    seen = depth[outputs["accumulation"] > 0.5][:: -(-depth.numel() // 2**24)]
-    shares = seen.new_tensor([_MAX_BEYOND, 1 - _MAX_BEYOND])
-    near, far = torch.quantile(seen, shares).tolist() if len(seen) else (0.0, 1.0)
+    seen = depth[outputs["accumulation"] > 0.5].cpu().numpy()
+    near, far = np.quantile(seen, [_MAX_BEYOND, 1 - _MAX_BEYOND]).tolist() if len(seen) else (0.0, 1.0)
     errors = colormaps.apply_colormap((error / ERROR_RANGE).clamp(0, 1), colormaps.ColormapOptions("inferno"))
     depths = colormaps.apply_depth_colormap(depth, outputs["accumulation"], near, max(far, near + 1e-9))
     return ViewPictures(to_image(truth), to_image(rendering), to_image(errors), to_image(depths), (near, far))
