@@ -67,11 +67,8 @@ def _image_panel(run: TrainedRun, images: list[tuple[int, Path]], time: int) -> 
     if not until:
         return np.zeros((camera.height, camera.width, 3), np.uint8)
     image = torch.from_numpy(np.array(read_image(until[-1]).convert("RGB"))) / 255
-    shown = to_image(run.model.reference_display(image))
-    if shown.size != (camera.width, camera.height):
-        # The image is of another camera than the events.
-        shown = shown.resize((camera.width, camera.height))
-    return np.asarray(shown)
+    # The image may be of another camera than the events.
+    return np.asarray(to_image(run.model.reference_display(image)).resize((camera.width, camera.height)))
 
 
 def _depth_panel(depth: Tensor, depth_range: tuple[float, float] | None) -> NDArray[np.uint8]:
