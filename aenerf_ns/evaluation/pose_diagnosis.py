@@ -9,6 +9,7 @@ import torch
 
 from aenerf_ns.camera.alignment import pose_errors
 from aenerf_ns.camera.trajectory import OPENCV_TO_OPENGL, Trajectory, homogeneous
+from aenerf_ns.checking.hypotheses import Comparison, Hypothesis
 from aenerf_ns.errors import DataError
 from aenerf_ns.evaluation.run import TrainedRun
 
@@ -37,12 +38,15 @@ def diagnose(run: TrainedRun) -> dict[str, Any]:
     estimated, corrected, _ = (scene.to_recording(poses) for poses in correction.compared_poses())
     # After alignment, because the scene may drift together with all poses, which changes nothing.
     size = pose_errors(corrected, estimated)
-    figures = {
+    comparison = _compare_contrast(run)
+    figures: dict[str, Any] = {
         "correction_rotation_degrees": size["rotation_error_degrees"],
         "correction_translation_recording_units": size["translation_error"],
         "correction_translation_extents": size["translation_error"] * scene.scale / correction.translation_unit,
         "clock_change_share_of_limit": abs(float(correction.clock_change_share())),
-        **_compare_contrast(run),
+        "contrast_estimated": None if comparison is None else comparison.contrast,
+        "contrast_corrected": None if comparison is None else comparison.given,
+        "contrast_is_clearly_lower": comparison is not None and comparison.is_clearly_better,
         "stretches": _measure_stretches(run),
     }
     return {"summary": summarize(figures), **figures}
@@ -96,37 +100,30 @@ def _measure_stretches(run: TrainedRun) -> list[dict[str, float]]:
     for chosen in middle.argsort().chunk(_NUM_STRETCHES):
         outputs = model(rays[torch.cat([chosen, chosen + len(batch)])])
         constant = outputs | {"log_radiance": torch.zeros_like(outputs["log_radiance"])}
-        loss, loss_of_constant_field = (
-            float(model.supervision.losses(rendered, batch[chosen])["reconstruction_loss"])
-            for rendered in (outputs, constant)
-        )
-        stretches.append(
-            {
-                "start_seconds": float(middle[chosen[0]]),
-                "end_seconds": float(middle[chosen[-1]]),
-                "loss": loss,
-                "loss_of_constant_field": loss_of_constant_field,
-            }
-        )
+        stretch = {"start_seconds": float(middle[chosen[0]]), "end_seconds": float(middle[chosen[-1]])}
+        for name, rendered in (("loss", outputs), ("loss_of_constant_field", constant)):
+            stretch[name] = float(model.supervision.losses(rendered, batch[chosen])["reconstruction_loss"])
+        stretches.append(stretch)
     model.train()
     return stretches
 
 
-def _compare_contrast(run: TrainedRun) -> dict[str, Any]:
-    """Compare the contrast of events warped by the estimated and by the corrected poses."""
+def _compare_contrast(run: TrainedRun) -> Comparison | None:
+    """Compare the contrast of events warped by the estimated and by the corrected poses.
+
+    None where too few events can be read, or get a direction from the lens.
+    """
     # Imported lazily: every ns-* command imports this module, and numba is slow to import.
     from aenerf_ns.checking.contrast import MIN_EVENTS, WarpedEvents
-    from aenerf_ns.checking.hypotheses import Hypothesis
 
     correction = run.model.camera_optimizer
-    absent = {"contrast_estimated": None, "contrast_corrected": None, "contrast_is_clearly_lower": False}
     try:
         events = run.dataset.timeline
     except DataError:
         # A method that trains on images has not read the events. They must not end it before its last checkpoint.
-        return absent
+        return None
     if len(events) < MIN_EVENTS:
-        return absent
+        return None
     base = correction.trajectory
     times = base.start + (base.end - base.start) * torch.arange(_NUM_POSES + 1) // _NUM_POSES
     times = times.unique()
@@ -136,12 +133,4 @@ def _compare_contrast(run: TrainedRun) -> dict[str, Any]:
             for source in (base, correction)
         )
     warped = WarpedEvents([events], Trajectory(times, corrected), run.dataset.scene.event_camera)
-    comparison = warped.compare(Hypothesis("estimated", poses=lambda _: estimated))
-    if comparison is None:
-        # The lens gives nearly no event a direction.
-        return absent
-    return {
-        "contrast_estimated": comparison.contrast,
-        "contrast_corrected": comparison.given,
-        "contrast_is_clearly_lower": comparison.is_clearly_better,
-    }
+    return warped.compare(Hypothesis("estimated", poses=lambda _: estimated))
