@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 from typing import BinaryIO
@@ -208,9 +208,11 @@ class TextEventFile(EventFile):
         ends = self._ends()
         if not ends:
             return None
+        beginning, last = ends
         tick = NANOSECONDS[self._unit_of(ends)]
-        first, last = (self._events(lines, tick).t for lines in ends)
-        return int(first[0]), int(last[0])
+        first = replace(beginning, whole=beginning.whole[:, :1], fraction=beginning.fraction[:, :1])
+        start, end = (int(self._events(lines, tick).t[0]) for lines in (first, last))
+        return start, end
 
     def _last_line(self, file: BinaryIO, names: list[str]) -> _Lines:
         """Parse the last event, which many comments and empty lines may follow."""
