@@ -46,7 +46,7 @@ _MIN_FROM_CENTER = 1e-3
 # 8K film cameras have 33 million pixels.
 _MAX_SIDE, _MAX_PIXELS = 1 << 14, 1 << 25
 _LIMITS = {"fx": (1e-2, 1e6), "fy": (1e-2, 1e6), "cx": (-1e6, 1e6), "cy": (-1e6, 1e6)}
-# Pixels along the shorter side that :meth:`CameraIntrinsics.has_valid_pixels` looks at.
+# Pixels along each side that :meth:`CameraIntrinsics.has_valid_pixels` looks at.
 _SAMPLES = 24
 
 
@@ -185,19 +185,30 @@ class CameraIntrinsics:
     def _named_distortion(self) -> dict[str, float]:
         return dict(zip(_PARAMETERS[self.lens_model], self.distortion, strict=True))
 
-    def pixel_directions(self, step: int = 1) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    def pixel_directions(self) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
         """Return the directions through the pixel centers, undistorted to the last digit.
-
-        Args:
-            step: pixels from one row or column to the next. With more than one, there are fewer of them.
 
         Returns:
             (height, width, 3) float64 unit vectors in the camera's frame with Nerfstudio's axes (x right, y up,
             z backward), and (height, width) whether the pixel has a direction. A pixel beyond the range in which the
             distortion model can be inverted has none.
         """
-        columns, rows = np.meshgrid(np.arange(0.0, self.width, step), np.arange(0.0, self.height, step))
-        shape, pixels = columns.shape, np.stack([columns, rows], -1).reshape(-1, 1, 2)
+        return self._directions(np.arange(self.width), np.arange(self.height))
+
+    def has_valid_pixels(self) -> bool:
+        """Return whether the distortion can be inverted at any of 24 x 24 sample pixels."""
+        columns, rows = (
+            np.linspace(0, side - 1, min(side, _SAMPLES)).astype(int) for side in (self.width, self.height)
+        )
+        return bool(self._directions(columns, rows)[1].any())
+
+    def _directions(
+        self, columns: NDArray[np.integer], rows: NDArray[np.integer]
+    ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+        """Return the directions through the pixels of (W,) columns and (H,) rows, as :meth:`pixel_directions` does."""
+        shape = len(rows), len(columns)
+        columns, rows = np.meshgrid(columns.astype(np.float64), rows.astype(np.float64))
+        pixels = np.stack([columns, rows], -1).reshape(-1, 1, 2)
         # OpenCV counts from the center of the first pixel.
         matrix = np.array([[self.fx, 0, self.cx - 0.5], [0, self.fy, self.cy - 0.5], [0, 0, 1.0]])
         distortion = np.array(self.distortion)
@@ -217,10 +228,6 @@ class CameraIntrinsics:
             error = np.linalg.norm(projected - pixels, axis=-1).reshape(shape)
             directions /= np.linalg.norm(directions, axis=-1, keepdims=True)
         return directions, error < _MAX_ROUND_TRIP_ERROR
-
-    def has_valid_pixels(self) -> bool:
-        """Return whether the distortion can be inverted at any of the sample pixels, 24 or more along each side."""
-        return bool(self.pixel_directions(max(min(self.width, self.height) // _SAMPLES, 1))[1].any())
 
     def crop(self, x: int, y: int, width: int, height: int) -> CameraIntrinsics:
         """Return the camera of the part of the sensor that begins at pixel (x, y) and has the given size in pixels."""
