@@ -28,6 +28,8 @@ _MAX_BYTES = 1 << 25
 _MAX_INTEGER = 2**63 - 1
 # float64 holds numbers up to 10^308.
 _MAX_EXPONENT = 300
+# Without traps, a number that is too large for Decimal is NaN.
+_NO_TRAPS = Context(traps=[])
 
 T = TypeVar("T")
 
@@ -98,8 +100,7 @@ def _convert_other(kind: type, value: Any) -> Any:
 
 
 def _parse_decimal(text: str) -> Decimal:
-    # Without traps, a number that is too large for Decimal is NaN.
-    value = Decimal(text, Context(traps=[]))
+    value = Decimal(text, _NO_TRAPS)
     if not value.is_finite() or value.adjusted() > _MAX_EXPONENT:
         raise ValueError(f"the number {text[:40]} is too large, or not finite")
     return value
