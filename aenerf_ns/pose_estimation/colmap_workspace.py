@@ -32,7 +32,7 @@ _NUM_NEIGHBORS = 10
 _NUM_KEY_FRAMES = 100
 # Files that are kept if a command is interrupted.
 _DATABASE, _INPUTS = "database.db", "inputs.txt"
-# Relative change of the cost at which an adjustment ends.
+# Relative change of the cost at which an adjustment ends. With COLMAP's own, 0, each one takes all its iterations.
 _TOLERANCE = 1e-4
 # Pixels that a match may be off.
 _MAX_EPIPOLAR_ERROR = 1.0
@@ -252,6 +252,7 @@ class ColmapWorkspace:
         options.mapper.abs_pose_refine_focal_length = options.mapper.abs_pose_refine_extra_params = refine_intrinsics
         options.mapper.abs_pose_min_num_inliers, options.mapper.init_min_num_inliers = MIN_POINTS, 50
         options.extract_colors = False
+        options.ba_global_function_tolerance = _TOLERANCE
         output, begun = self._new_folder(), None
         if start is not None:
             options.multiple_models, begun = False, self._new_folder()
@@ -381,5 +382,4 @@ def _keep_intrinsics(adjustment: Any) -> None:
     adjustment.refine_focal_length = adjustment.refine_principal_point = adjustment.refine_extra_params = False
     adjustment.ceres.use_gpu = adjustment.print_summary = False
     adjustment.ceres.solver_options.num_threads = 1
-    # With COLMAP's own tolerance of 0, each adjustment takes all its iterations.
     adjustment.ceres.solver_options.function_tolerance = _TOLERANCE
