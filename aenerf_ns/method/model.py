@@ -224,6 +224,17 @@ class AENeRFModel(Model):
         moved = replace(camera, camera_to_worlds=self.camera_optimizer.apply_to_camera(camera))
         return super().get_outputs_for_camera(moved, obb_box)
 
+    def get_outputs_for_camera_ray_bundle(self, camera_ray_bundle: RayBundle) -> dict[str, Tensor]:
+        """Render the rays of a picture. Those that miss a crop box see nothing, at the far plane."""
+        outputs = super().get_outputs_for_camera_ray_bundle(camera_ray_bundle)
+        nears, fars = camera_ray_bundle.nears, camera_ray_bundle.fars
+        if nears is not None and fars is not None:
+            # Both their ends are 1e10, of which single precision has no disparity: what is rendered there is NaN.
+            missed = (nears == fars)[..., 0]
+            for name, picture in outputs.items():
+                picture[missed] = self.config.far_plane if name == "depth" else 0.0
+        return outputs
+
     def get_outputs(self, ray_bundle: RayBundle) -> dict[str, Any]:
         """Render rays.
 

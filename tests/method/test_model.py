@@ -9,7 +9,9 @@ import pytest
 import torch
 import torch.nn.functional as F
 from helpers.small_models import ALL_LOSSES, make_batch, make_model, make_rays
+from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.cameras.rays import Frustums, RaySamples
+from nerfstudio.data.scene_box import OrientedBox
 from nerfstudio.model_components.losses import interlevel_loss
 from torch import Tensor
 
@@ -34,6 +36,17 @@ def test_outputs_have_their_shapes_and_ranges(backbone: str, bounded: bool, baye
     assert (outputs["rgb"] >= 0).all()
     assert (outputs["rgb"] <= 1).all()
     assert all(torch.isfinite(value).all() for value in outputs.values())
+
+
+@pytest.mark.parametrize("bounded", [False, True])
+def test_beside_a_crop_box_there_is_nothing(bounded: bool) -> None:
+    model = make_model(bounded=bounded).eval()
+    camera = Cameras(torch.eye(4)[None, :3], fx=4.0, fy=4.0, cx=4.0, cy=3.0, width=8, height=6)
+    box = OrientedBox(torch.eye(3), torch.tensor([0.0, 0.0, -1.0]), torch.full((3,), 0.5))
+    outputs = model.get_outputs_for_camera(camera, box)
+    assert all(torch.isfinite(value).all() for value in outputs.values())
+    assert outputs["accumulation"][0, 0] == 0
+    assert outputs["accumulation"][3, 4] > 0
 
 
 def test_between_events_changes_within_the_thresholds_are_right() -> None:
