@@ -45,6 +45,8 @@ from aenerf_ns.supervision.event_pairs import PairLossCoefficients, PairSupervis
 
 # ε of the paper's appendix "Model Architecture": the least radiance that is rendered.
 _RADIANCE_EPSILON = 1e-3
+# Beyond some 1.7e7 units, disparity is 0 in float32: the last sample would be at infinity, and count for nothing.
+_MAX_FAR_PLANE = 1e7
 # The error of a display value that has the last color of the error's color map.
 _MAX_SHOWN_ERROR = 0.5
 
@@ -390,9 +392,9 @@ def _require_possible(config: AENeRFModelConfig, duration: float) -> None:
         duration: seconds of the trajectory.
     """
     near, far = config.near_plane, config.far_plane
-    if not 0 <= near < far < math.inf:
+    if not 0 <= near < far <= _MAX_FAR_PLANE:
         problem = f"near_plane {near:g} and far_plane {far:g}"
-        raise DataError("model", problem, "give a finite far plane above the near one")
+        raise DataError("model", problem, f"give a far plane above the near one, at most {_MAX_FAR_PLANE:g}")
     if config.color_correction_num_rays < 1:
         raise DataError("model", f"color_correction_num_rays {config.color_correction_num_rays}", "give thousands")
     rounds, networks = len(config.proposal.num_samples_per_ray), len(config.proposal.max_resolutions)

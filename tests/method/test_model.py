@@ -260,6 +260,7 @@ def test_pictures_are_also_rendered_without_color_correction() -> None:
         ({"camera_optimizer": PoseCorrectionConfig(knot_interval=0.0)}, "knot_interval 0; give seconds above 0"),
         ({"camera_optimizer": PoseCorrectionConfig(clock_offset=-20.0)}, "clock_offset -20; give seconds, fewer than"),
         ({"camera_optimizer": PoseCorrectionConfig(clock_offset=math.nan)}, "clock_offset nan; give seconds"),
+        ({"far_plane": 1e8}, r"far_plane 1e\+08; give a far plane above the near one, at most 1e\+07"),
         ({"average_init_density": 0.0}, "average_init_density 0; give a number above 0"),
         ({"color_correction_num_rays": 0}, "color_correction_num_rays 0; give thousands"),
         ({"average_init_density": 1000.0}, "average_init_density 1000; .* below 700"),
