@@ -411,7 +411,7 @@ def _require_possible(config: AENeRFModelConfig, duration: float) -> None:
     for name, count in counts.items():
         if count < 1:
             raise DataError("model", f"{name} {count}", "give one or more")
-    if not config.camera_optimizer.knot_interval > 0:
+    if not 0 < config.camera_optimizer.knot_interval < math.inf:
         raise DataError("model", f"knot_interval {config.camera_optimizer.knot_interval:g}", "give seconds above 0")
     offset = config.camera_optimizer.clock_offset
     # Beyond it, all events would see the pose of one end.

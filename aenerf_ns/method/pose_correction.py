@@ -449,7 +449,7 @@ class TwistSpline(nn.Module):
     def __init__(self, duration: float, knot_interval: float, with_finer: bool = False) -> None:
         super().__init__()
         self.finer = TwistSpline(duration, knot_interval / _FINER) if with_finer else None
-        self._segments = max(math.ceil(duration / knot_interval), 1)
+        self._segments = math.ceil(duration / knot_interval)
         self._interval = duration / self._segments
         self.control_twists = nn.Parameter(torch.zeros(self._segments + 3, 6))
         # https://en.wikipedia.org/wiki/B-spline, the uniform cubic basis: row k has the factors of uᵏ.

@@ -258,6 +258,7 @@ def test_pictures_are_also_rendered_without_color_correction() -> None:
         ({"proposal": {"num_samples_per_ray": (0,)}}, "proposal.num_samples_per_ray 0; give one or more"),
         ({"proposal": {"num_levels": 0}}, "proposal.num_levels 0; give one or more"),
         ({"camera_optimizer": PoseCorrectionConfig(knot_interval=0.0)}, "knot_interval 0; give seconds above 0"),
+        ({"camera_optimizer": PoseCorrectionConfig(knot_interval=math.inf)}, "knot_interval inf; give seconds"),
         ({"camera_optimizer": PoseCorrectionConfig(clock_offset=-20.0)}, "clock_offset -20; give seconds, fewer than"),
         ({"camera_optimizer": PoseCorrectionConfig(clock_offset=math.nan)}, "clock_offset nan; give seconds"),
         ({"far_plane": 1e8}, r"far_plane 1e\+08; give a far plane above the near one, at most 1e\+07"),
