@@ -19,7 +19,7 @@ from nerfstudio.field_components.field_heads import FieldHeadNames
 from nerfstudio.field_components.spatial_distortions import SceneContraction
 from nerfstudio.model_components.losses import interlevel_loss
 from nerfstudio.model_components.ray_samplers import UniformSampler
-from nerfstudio.model_components.renderers import AccumulationRenderer, DepthRenderer
+from nerfstudio.model_components.renderers import DepthRenderer
 from nerfstudio.model_components.scene_colliders import NearFarCollider
 from nerfstudio.models.base_model import Model, ModelConfig
 from nerfstudio.utils import colormaps
@@ -171,7 +171,6 @@ class AENeRFModel(Model):
             sensor=self.sensor, loss_coefficients=config.loss_coefficients
         )
         self.color_correction = self.new_color_correction(config.color_correction)
-        self.renderer_accumulation = AccumulationRenderer()
         self.renderer_depth = DepthRenderer(method="median")
         self.image_metrics = ImageMetrics(with_lpips=config.lpips)
 
@@ -276,7 +275,7 @@ class AENeRFModel(Model):
             if self.sensor.num_channels > 1:
                 # The viewer takes three channels for a picture: it has color maps for single channels only.
                 outputs["mean_log_radiance"] = log_radiance.mean(-1, keepdim=True)
-            outputs["accumulation"] = self.renderer_accumulation(weights)
+            outputs["accumulation"] = weights.sum(-2)
             outputs["depth"] = self.renderer_depth(weights=weights, ray_samples=samples)
         return outputs
 

@@ -31,7 +31,7 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 from nerfstudio.cameras.rays import RayBundle
-from nerfstudio.model_components.renderers import AccumulationRenderer, DepthRenderer
+from nerfstudio.model_components.renderers import DepthRenderer
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -139,7 +139,7 @@ class PAEv3DSupervision(ChangeSupervision):
             # The first half of the rays are the starts of the windows.
             weights = outputs["weights_list"][-1][: len(batch)]
             depth = DepthRenderer("expected")(weights, outputs["ray_samples_list"][-1][: len(batch)])[:, 0]
-            opacity, speed = AccumulationRenderer()(weights)[:, 0], batch.displacement.norm(dim=-1)
+            opacity, speed = weights.sum(-2)[:, 0], batch.displacement.norm(dim=-1)
             start = outputs["log_radiance"][: len(batch)].unflatten(0, (-1, 2, 2))
             by_flow = change_by_flow(start, batch.displacement.unflatten(0, (-1, 2, 2))).flatten(0, 2)
             losses["mask_loss"] = mask_loss(opacity, speed > 0)
