@@ -160,7 +160,6 @@ class AENeRFModel(Model):
         self.proposal_sampler = ProposalSampler(
             num_nerf_samples_per_ray=config.field.num_samples_per_ray,
             num_proposal_samples_per_ray=config.proposal.num_samples_per_ray,
-            num_proposal_network_iterations=len(self.density_fns),
             single_jitter=True,
             # By default evenly up to a distance of 1, and then evenly in disparity.
             initial_sampler=UniformSampler(single_jitter=True) if distortion is None else None,
