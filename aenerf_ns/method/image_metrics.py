@@ -55,11 +55,8 @@ class ImageMetrics:
             predicted, share = torch.where(mask.to(predicted.device), predicted, reference), float(mask.float().mean())
         predicted, reference = (image.moveaxis(-1, 0)[None].float() for image in (predicted, reference))
         psnr = float(peak_signal_noise_ratio(predicted, reference, data_range=1.0)) + 10 * math.log10(share)
-        ssim = structural_similarity_index_measure(predicted, reference, data_range=1.0)
-        metrics = {
-            "psnr": min(psnr, _MAX_PSNR),
-            "ssim": 1 - (1 - float(torch.as_tensor(ssim))) / share if share < 1 else float(torch.as_tensor(ssim)),
-        }
+        ssim = float(torch.as_tensor(structural_similarity_index_measure(predicted, reference, data_range=1.0)))
+        metrics = {"psnr": min(psnr, _MAX_PSNR), "ssim": 1 - (1 - ssim) / share if share < 1 else ssim}
         if self._lpips is None and self.lpips_absent is None:
             self._build_lpips(predicted.device)
         if self._lpips is not None:
