@@ -158,8 +158,7 @@ class PoseCorrection(CameraOptimizer):
 
     def pose(self, seconds: Tensor) -> Tensor:
         """Return corrected (N, 3, 4) float64 poses at (N,) float64 seconds since the trajectory's start."""
-        base = self.trajectory.pose(self.on_clock_of_poses(seconds))
-        pose = base
+        base = pose = self.trajectory.pose(self.on_clock_of_poses(seconds))
         if self.twists is not None:
             pose = self._exponential(pose, self._twist_units * self.twists(seconds, base))
         if self.rigid_offset is not None:
@@ -295,18 +294,17 @@ class PoseCorrection(CameraOptimizer):
         _, corrected, reference = self.compared_poses()
         return align_most(corrected, reference)
 
+    @torch.no_grad()
     def compared_poses(self) -> tuple[Tensor, Tensor, Tensor]:
         """Return estimated, corrected and reference poses (N, 3, 4) at the same times, in scene units.
 
         Where there are no true poses, the reference is the estimated trajectory at the times of the corrected clock: an
         offset of the clock moves no place of the world.
         """
-        seconds = self._compared_seconds
-        with torch.no_grad():
-            estimated, corrected = self.trajectory.pose(seconds), self.pose(seconds)
-            if self._true_poses is not None:
-                return estimated, corrected, self._true_poses
-            return estimated, corrected, self.trajectory.pose(self.on_clock_of_poses(seconds))
+        seconds, reference = self._compared_seconds, self._true_poses
+        if reference is None:
+            reference = self.trajectory.pose(self.on_clock_of_poses(seconds))
+        return self.trajectory.pose(seconds), self.pose(seconds), reference
 
     def ray_rates(self, raybundle: RayBundle) -> tuple[Tensor, Tensor]:
         """Return the derivatives of the corrected rays' origins and directions (N, 3) by time, per second."""
@@ -321,23 +319,24 @@ class PoseCorrection(CameraOptimizer):
             penalty = (self._penalties * self._sampled_twists().square().mean(0)).sum()
             loss_dict["pose_correction_penalty"] = penalty.float()
 
+    @torch.no_grad()
     def get_metrics_dict(self, metrics_dict: dict[str, Any]) -> None:
         """Add the offsets and the root mean square size of the corrections: scene units, degrees and seconds."""
-        with torch.no_grad():
-            metrics_dict |= self.offsets()
-            if self.twists is not None:
-                twists = (self._twist_units * self._sampled_twists()).unflatten(-1, (2, 3))
-                size = twists.square().sum(-1).mean(0).sqrt()
-                metrics_dict["pose_correction_translation"] = size[0]
-                metrics_dict["pose_correction_degrees"] = torch.rad2deg(size[1])
+        metrics_dict |= self.offsets()
+        if self.twists is not None:
+            twists = (self._twist_units * self._sampled_twists()).unflatten(-1, (2, 3))
+            size = twists.square().sum(-1).mean(0).sqrt()
+            metrics_dict["pose_correction_translation"] = size[0]
+            metrics_dict["pose_correction_degrees"] = torch.rad2deg(size[1])
 
+    @torch.no_grad()
     def offsets(self) -> dict[str, float]:
         """Return the learned offsets by name: seconds, degrees and scene units; none where they are not learned."""
         found = {}
         if self.clock_change is not None:
-            found["clock_offset_seconds"] = float(self.clock_offset().detach())
+            found["clock_offset_seconds"] = float(self.clock_offset())
         if self.rigid_offset is not None:
-            translation, rotation = self._rigid_twists(1).detach().unflatten(-1, (2, 3)).norm(dim=-1)[0].tolist()
+            translation, rotation = self._rigid_twists(1).unflatten(-1, (2, 3)).norm(dim=-1)[0].tolist()
             found["rigid_offset_degrees"] = math.degrees(rotation)
             found["rigid_offset_translation"] = translation
         return found
@@ -430,10 +429,8 @@ class TwistNetwork(nn.Module):
     def with_rate(self, seconds: Tensor, base: Tensor, base_rate: Tensor) -> tuple[Tensor, Tensor]:
         """Return float64 twists and their rates per second (N, 6), for estimated poses and their rates (N, 3, 4)."""
         with forward_ad.dual_level():
-            moving = self(
-                forward_ad.make_dual(seconds, torch.ones_like(seconds)), forward_ad.make_dual(base, base_rate)
-            )
-            twist, rate = forward_ad.unpack_dual(moving)
+            moving = forward_ad.make_dual(seconds, torch.ones_like(seconds)), forward_ad.make_dual(base, base_rate)
+            twist, rate = forward_ad.unpack_dual(self(*moving))
         return twist, rate
 
 
