@@ -6,12 +6,14 @@ import sys
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from types import FrameType
 from typing import Any
 
 import pytest
 import torch
 import torch.autograd.forward_ad as forward_ad
 from nerfstudio.field_components.encodings import HashEncoding as FrameworkHashEncoding
+from nerfstudio.viewer_legacy.server.viewer_utils import IOChangeException, SetTrace
 from torch import Tensor
 
 from aenerf_ns.method import hash_grid
@@ -273,6 +275,16 @@ def nothing_known() -> Iterator[None]:
     yield
     for cache in caches:
         cache.cache_clear()
+
+
+def test_the_viewer_does_not_interrupt_the_loading_of_kernels(nothing_known: None) -> None:
+    def interrupt(frame: FrameType, *_: Any) -> None:
+        if frame.f_code.co_name == "self_test":
+            raise IOChangeException
+
+    with SetTrace(interrupt):
+        loaded = loader.try_load(NUMBA, torch.device("cpu"))
+    assert loaded is not None
 
 
 @pytest.mark.parametrize(
