@@ -20,8 +20,7 @@ class ImageMetrics:
     """PSNR, SSIM and, when asked for, LPIPS of an image.
 
     Args:
-        with_lpips: whether to report LPIPS. Its network is built on first use. Where the weights cannot be had, the
-            metric is left out and ``lpips_absent`` tells why.
+        with_lpips: whether to report LPIPS where its weights can be had. Its network is built on first use.
 
     Attributes:
         lpips_absent: why LPIPS is not reported, or None.

@@ -283,9 +283,8 @@ class PairSampler(Sampler):
     (:func:`~aenerf_ns.events.pair_store.event_counts`), and pairs count less, the more they miss. A learned refractory
     period needs pairs of consecutive events and none that end at moments, because the pixel may be blind at a moment.
 
-    Draws from torch's global generator of the device that holds the pairs, which Nerfstudio seeds. That is the device
-    of the batches if the pairs take at most half of the device's free memory. Otherwise the pairs stay in host memory,
-    or in their file, and a step copies two pinned arrays to the device without waiting.
+    Draws from torch's global generator of the device that holds the pairs (:class:`.PairTable`), which Nerfstudio
+    seeds.
 
     Args:
         config, dataset, device: see :class:`Sampler`.

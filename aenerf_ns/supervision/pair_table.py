@@ -20,7 +20,8 @@ class PairTable:
 
     Args:
         pairs: all pairs.
-        device: of the batches. It also holds the pairs, if they take at most half of its free memory.
+        device: of the batches. It also holds the pairs, if they take at most half of its free memory. Otherwise they
+            stay in host memory, or in their file, and a step copies two pinned arrays to the device without waiting.
     """
 
     def __init__(self, pairs: EventPairs, device: torch.device | str) -> None:
