@@ -52,5 +52,5 @@ class _Softplus(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, grad: Tensor, grad_rates: Tensor | None) -> tuple[Tensor | None, ...]:
         outputs, tangents = ctx.saved_tensors
-        grad_rates = None if tangents is None or grad_rates is None else grad_rates.contiguous()
+        grad_rates = None if grad_rates is None else grad_rates.contiguous()
         return *ctx.kernels.gradients(outputs, tangents, grad.contiguous(), grad_rates, ctx.beta), None, None
