@@ -251,11 +251,10 @@ class PoseCorrection(CameraOptimizer):
         carried = self.alignment().inverse()(poses.double())
         if not self.has_ground_truth:
             seconds = metadata[REFERENCE_SECONDS][..., 0]
-            on_trajectory = seconds.isfinite()
             taken = seconds.nan_to_num(0.0)
             motion = homogeneous(self.pose(taken)) @ torch.linalg.inv(homogeneous(self.trajectory.pose(taken)))
             moved = (motion @ homogeneous(poses.double()))[:, :3]
-            carried = torch.where(on_trajectory[:, None, None], moved, carried)
+            carried = torch.where(seconds.isfinite()[:, None, None], moved, carried)
         return carried.to(poses)
 
     def world_twists(self, seconds: Tensor, base: Tensor) -> Tensor:
