@@ -17,6 +17,7 @@ from nerfstudio.data.scene_box import OrientedBox
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttributes, TrainingCallbackLocation
 from nerfstudio.field_components.field_heads import FieldHeadNames
 from nerfstudio.field_components.spatial_distortions import SceneContraction
+from nerfstudio.model_components import renderers
 from nerfstudio.model_components.losses import interlevel_loss
 from nerfstudio.model_components.ray_samplers import UniformSampler
 from nerfstudio.model_components.renderers import DepthRenderer
@@ -225,7 +226,7 @@ class AENeRFModel(Model):
         return super().get_outputs_for_camera(moved, obb_box)
 
     def get_outputs_for_camera_ray_bundle(self, camera_ray_bundle: RayBundle) -> dict[str, Tensor]:
-        """Render the rays of a picture. Those that miss a crop box see nothing, at the far plane."""
+        """Render the rays of a picture. Around what is in a crop box is the crop's background color, if any."""
         outputs = super().get_outputs_for_camera_ray_bundle(camera_ray_bundle)
         nears, fars = camera_ray_bundle.nears, camera_ray_bundle.fars
         if nears is not None and fars is not None:
@@ -233,6 +234,8 @@ class AENeRFModel(Model):
             missed = (nears == fars)[..., 0]
             for name, picture in outputs.items():
                 picture[missed] = self.config.far_plane if name == "depth" else 0.0
+            if (color := renderers.BACKGROUND_COLOR_OVERRIDE) is not None:
+                outputs["rgb"] = torch.lerp(color.to(outputs["rgb"]), outputs["rgb"], outputs["accumulation"])
         return outputs
 
     def get_outputs(self, ray_bundle: RayBundle) -> dict[str, Any]:

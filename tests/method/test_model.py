@@ -13,6 +13,7 @@ from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.cameras.rays import Frustums, RaySamples
 from nerfstudio.data.scene_box import OrientedBox
 from nerfstudio.model_components.losses import interlevel_loss
+from nerfstudio.model_components.renderers import background_color_override_context
 from torch import Tensor
 
 from aenerf_ns.errors import DataError
@@ -39,13 +40,16 @@ def test_outputs_have_their_shapes_and_ranges(backbone: str, bounded: bool, baye
 
 
 @pytest.mark.parametrize("bounded", [False, True])
-def test_beside_a_crop_box_there_is_nothing(bounded: bool) -> None:
+def test_beside_a_crop_box_there_is_the_color_of_the_crop(bounded: bool) -> None:
     model = make_model(bounded=bounded).eval()
     camera = Cameras(torch.eye(4)[None, :3], fx=4.0, fy=4.0, cx=4.0, cy=3.0, width=8, height=6)
     box = OrientedBox(torch.eye(3), torch.tensor([0.0, 0.0, -1.0]), torch.full((3,), 0.5))
-    outputs = model.get_outputs_for_camera(camera, box)
+    color = torch.tensor([1.0, 0.5, 0.0])
+    with background_color_override_context(color):
+        outputs = model.get_outputs_for_camera(camera, box)
     assert all(torch.isfinite(value).all() for value in outputs.values())
     assert outputs["accumulation"][0, 0] == 0
+    assert torch.equal(outputs["rgb"][0, 0], color)
     assert outputs["accumulation"][3, 4] > 0
 
 
