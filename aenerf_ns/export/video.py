@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
@@ -35,8 +36,12 @@ def render_panels(run: TrainedRun, times: Tensor) -> Iterator[NDArray[np.uint8]]
     on the trajectory. The run is in evaluation mode.
     """
     recording = run.recording
-    camera = recording.event_camera
-    trigger = RenderedEvents(recording.sensor, camera.width, camera.height)
+    camera, sensor = recording.event_camera, recording.sensor
+    # Rendered changes agree with the thresholds that were learned along with them.
+    ratio = run.model.supervision.learned_values().get("contrast_threshold_ratio")
+    if ratio is not None:
+        sensor = replace(sensor, positive_contrast_threshold=ratio * sensor.negative_contrast_threshold)
+    trigger = RenderedEvents(sensor, camera.width, camera.height)
     images = [(time, file) for time, file in recording.frames if file.is_file()]
     poses = corrected_poses(run, times)
     trigger(render(run, camera, poses[0])["log_radiance"].cpu().numpy())

@@ -3,6 +3,7 @@
 from dataclasses import replace
 from itertools import count
 from pathlib import Path
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -16,11 +17,10 @@ from aenerf_ns.camera.time_window import TimeWindow
 from aenerf_ns.camera.trajectory import homogeneous
 from aenerf_ns.errors import DataError
 from aenerf_ns.evaluation.run import TrainedRun
-from aenerf_ns.export import frames, mesh
+from aenerf_ns.export import frames, mesh, video
 from aenerf_ns.export.camera_model_files import PlacedImage
 from aenerf_ns.export.rendering import corrected_poses, observe_points, place_views
 from aenerf_ns.export.times import spread_times, times_at_rate, times_from_seconds
-from aenerf_ns.export.video import render_panels
 
 SECOND = 10**9
 
@@ -83,10 +83,22 @@ def test_fewer_points_than_images_are_spread_over_them(run: TrainedRun) -> None:
 
 def test_a_video_shows_an_image_from_when_it_was_taken(run: TrainedRun) -> None:
     # The image is the last of five panels, below a line of text. It was taken at 0.25 s.
-    pictures = render_panels(run, torch.tensor([0, 2, 3]) * SECOND // 10)
+    pictures = video.render_panels(run, torch.tensor([0, 2, 3]) * SECOND // 10)
     before, after = (picture[16:, 4 * picture.shape[1] // 5 : -4] for picture in pictures)
     assert (before == 0).all()
     assert (after > 0).any()
+
+
+def test_a_video_triggers_events_by_learned_thresholds(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    config = make_pipeline_config(tmp_path / "made")
+    config.model.supervision.learn_contrast_threshold_ratio = True
+    made = config.setup(device="cpu", test_mode="test").eval()
+    made.model.supervision.raw_ratio.data.fill_(20.0)
+    trigger = Mock(wraps=video.RenderedEvents)
+    monkeypatch.setattr(video, "RenderedEvents", trigger)
+    next(video.render_panels(made.trained_run(), torch.tensor([0, SECOND])))
+    sensor = trigger.call_args.args[0]
+    assert sensor.positive_contrast_threshold == pytest.approx(20 * sensor.negative_contrast_threshold)
 
 
 def test_depths_too_far_to_be_written_are_counted(
