@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import sys
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Any, Literal
 
 from nerfstudio.cameras.rays import RayBundle
@@ -62,7 +64,8 @@ class EventDataManager(VanillaDataManager[EventDataset]):
         """
         views = self.reference_views(self.test_split)
         self.has_reference_views = views is not None
-        if views is None and self.test_mode != "val":
+        # ns-render dataset --split val opens the validation views as a training does.
+        if views is None and (self.test_mode != "val" or Path(sys.argv[0]).name == "ns-render"):
             return self.train_dataset
         return views
 

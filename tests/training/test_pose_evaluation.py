@@ -227,6 +227,14 @@ def test_a_trained_run_shows_and_exports_the_corrected_poses(num_views: int, tmp
     assert not start.metadata
 
 
+def test_ns_render_shows_training_cameras_where_there_are_no_validation_views(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("sys.argv", ["ns-render", "dataset", "--split", "val"])
+    data = make_pipeline_config(tmp_path / "made", num_views=0).datamanager.setup(device="cpu", test_mode="val")
+    assert data.eval_dataset is data.train_dataset
+
+
 def test_ground_truth_must_overlap_the_estimated_poses(random_poses: torch.Tensor) -> None:
     truth = make_truth(random_poses)
     late = Trajectory(truth.times + 8 * SECOND, truth.camera_to_worlds, "truth.txt")
