@@ -37,7 +37,7 @@ def place_views(run: TrainedRun) -> list[tuple[PlacedImage, Path]]:
         The images and their files.
 
     Raises:
-        DataError: the recording has no images, or their files are missing.
+        DataError: the recording has no images.
     """
     recording = run.recording
     split_of: dict[Path, tuple[Split, ReferenceView]] = {}
@@ -45,15 +45,13 @@ def place_views(run: TrainedRun) -> list[tuple[PlacedImage, Path]]:
         views = views_within(recording.reference_views[split], run.scene.window)
         for view in views if split == "train" else thin_views(views, recording.max_views):
             split_of[view.file] = (split, view)
-    found = {file: entry for file, entry in split_of.items() if file.is_file()}
-    if not found:
-        problem = "its images are missing" if split_of else "it has no images"
-        raise DataError(run.data, problem, "aenerf export-frames renders images along the trajectory")
-    poses = _place_poses(run, [view for _, view in found.values()])
-    common = Path(os.path.commonpath([file.parent for file in found]))
+    if not split_of:
+        raise DataError(run.data, "it has no images", "aenerf export-frames renders images along the trajectory")
+    poses = _place_poses(run, [view for _, view in split_of.values()])
+    common = Path(os.path.commonpath([file.parent for file in split_of]))
     return [
         (PlacedImage(file.relative_to(common).as_posix(), recording.frame_camera, pose.numpy(), split), file)
-        for (file, (split, _)), pose in zip(found.items(), poses, strict=True)
+        for (file, (split, _)), pose in zip(split_of.items(), poses, strict=True)
     ]
 
 

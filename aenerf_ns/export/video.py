@@ -42,7 +42,7 @@ def render_panels(run: TrainedRun, times: Tensor) -> Iterator[NDArray[np.uint8]]
     if ratio is not None:
         sensor = replace(sensor, positive_contrast_threshold=ratio * sensor.negative_contrast_threshold)
     trigger = RenderedEvents(sensor, camera.width, camera.height)
-    images = [(time, file) for time, file in recording.frames if file.is_file()]
+    images = recording.frames
     poses = corrected_poses(run, times)
     trigger(render(run, camera, poses[0])["log_radiance"].cpu().numpy())
     recorded = sum_recorded_events(recording.event_file, times.numpy())
