@@ -10,11 +10,12 @@ from __future__ import annotations
 import contextlib
 import threading
 import time
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import viser.transforms
 from nerfstudio.utils import colormaps
+from nerfstudio.viewer.viewer import VISER_NERFSTUDIO_SCALE_RATIO, Viewer
 from nerfstudio.viewer.viewer_elements import ViewerCheckbox, ViewerControl, ViewerSlider
 from numpy.typing import NDArray
 from torch import nn
@@ -24,9 +25,6 @@ from aenerf_ns.errors import errors_as_one_line
 from aenerf_ns.evaluation.view_metrics import to_image
 from aenerf_ns.viewer.elements import DownloadButton, ViewerMarkdown
 from aenerf_ns.viewer.recording_view import RecordingView, png
-
-if TYPE_CHECKING:
-    from nerfstudio.viewer.viewer import Viewer
 
 # Maximum share of the training time that drawing takes, and minimum seconds between two drawings: a browser is sent at
 # most 25 KB a second.
@@ -176,23 +174,17 @@ class RecordingPanel(nn.Module):
         points, colors = self.view.points(events if in_scene else events[:0])
         scene.add_point_cloud(
             "/recording/events",
-            points * self._scale(),
+            points * VISER_NERFSTUDIO_SCALE_RATIO,
             colors,
-            point_size=0.002 * self._scale(),
+            point_size=0.002 * VISER_NERFSTUDIO_SCALE_RATIO,
             point_shape="circle",
             visible=in_scene,
         )
 
-    # No property, because Nerfstudio reads all attributes while it looks for elements.
-    def _scale(self) -> float:
-        """Return the viewer's units in a unit of the scene."""
-        assert self._viewer is not None
-        return self._viewer.control_panel.viser_scale_ratio
-
     def _in_viewer(self, pose: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return a pose (3, 4), OpenGL axes, as the viewer's quaternion, OpenCV axes, and position."""
         rotation = viser.transforms.SO3.from_matrix(pose[:, :3]) @ viser.transforms.SO3.from_x_radians(np.pi)
-        return rotation.wxyz, pose[:, 3] * self._scale()
+        return rotation.wxyz, pose[:, 3] * VISER_NERFSTUDIO_SCALE_RATIO
 
     def _place(self, client: ClientHandle, pose: NDArray[np.float64]) -> None:
         """Move a browser's view to a pose (3, 4)."""
@@ -225,7 +217,7 @@ class RecordingPanel(nn.Module):
             self._lines[name] = state
             self._viewer.viser_server.scene.add_spline_catmull_rom(
                 f"/recording/trajectory_{name}",
-                points * self._scale(),
+                points * VISER_NERFSTUDIO_SCALE_RATIO,
                 line_width=2.0,
                 color=_COLORS[name],
                 segments=2 * len(points),
