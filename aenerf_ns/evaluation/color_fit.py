@@ -33,7 +33,6 @@ class ColorFit:
                 "figures that were made so."
             )
 
-    @torch.no_grad()
     def fit(self, share: float = 1.0) -> None:
         """Fit the color correction on a share of the configured number of pixels. A share below 1 makes a rough fit."""
         model, correction = self._run.model, self._run.model.color_correction

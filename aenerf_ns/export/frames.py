@@ -25,7 +25,6 @@ FARTHEST = _MAX_DEPTH * DEPTH_UNIT
 """The largest depth that is written, in units of the recording."""
 
 
-@torch.no_grad()
 def export_frames(run: TrainedRun, folder: Path, times: Tensor, num_points: int) -> float:
     """Render frames and depths at (N,) times in nanoseconds, and write them with their cameras to a new folder.
 

@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 from nerfstudio.engine.trainer import TrainerConfig
 from PIL import Image
 
@@ -48,7 +47,6 @@ def export_predictions(run: TrainedRun, folder: Path, config: TrainerConfig, vie
     write_results(folder / _RESULTS_FILE, folder / _PREDICTIONS, info, placed)
 
 
-@torch.no_grad()
 def _render_views(run: TrainedRun, names: list[str]) -> Iterator[tuple[str, Image.Image, Image.Image]]:
     """Yield name, rendering and truth of each test view."""
     model, views = run.model.eval(), run.views

@@ -87,7 +87,6 @@ def _make_cameras(run: TrainedRun, camera: CameraIntrinsics, poses: Tensor) -> C
     return camera.cameras(run.scene.to_scene(poses)).to(run.device)
 
 
-@torch.no_grad()
 def render(run: TrainedRun, camera: CameraIntrinsics, pose: Tensor) -> dict[str, Tensor]:
     """Render a view from a pose (3, 4) or (4, 4) in the recording's world, OpenCV axes. The run is in evaluation mode.
 
@@ -100,7 +99,6 @@ def render(run: TrainedRun, camera: CameraIntrinsics, pose: Tensor) -> dict[str,
     return {**outputs, "depth": depth}
 
 
-@torch.no_grad()
 def observe_points(run: TrainedRun, images: Sequence[PlacedImage], max_points: int) -> ObservedPoints:
     """Render points on the surfaces that images of one lens see, in the recording's world, at pixels spread over them.
 

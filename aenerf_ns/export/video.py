@@ -27,7 +27,6 @@ from aenerf_ns.recording.images import read_image
 _MIN_HEIGHT, _LABEL, _GAP = 240, 16, 4
 
 
-@torch.no_grad()
 def render_panels(run: TrainedRun, times: Tensor) -> Iterator[NDArray[np.uint8]]:
     """Render the pictures (height, width, 3) of a video, one for each of the (N,) times in nanoseconds but the first.
 

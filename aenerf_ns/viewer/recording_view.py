@@ -54,7 +54,6 @@ class RecordingView:
         correction = self._model.camera_optimizer
         return correction.pose(torch.tensor([seconds], dtype=torch.float64, device=self._model.device))[0].cpu().numpy()
 
-    @torch.no_grad()
     def lines(self) -> dict[str, NDArray[np.float64]]:
         """Return points (N, 3) along the ``estimated``, ``corrected`` and, where it is known, ``true`` trajectory.
 
