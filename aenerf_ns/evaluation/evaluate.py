@@ -26,7 +26,7 @@ def evaluate(run: TrainedRun, output: Path | None = None, with_deviations: bool 
 
     Args:
         run: as it is opened to be tested.
-        output: folder for pictures, or None.
+        output: existing folder for pictures, or None.
         with_deviations: add the standard deviations over the views.
 
     Raises:

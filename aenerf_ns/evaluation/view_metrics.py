@@ -30,7 +30,7 @@ def measure_reference_views(
 
     Args:
         run: with its views.
-        output: folder for pictures, which are named as ns-eval names them, or None.
+        output: existing folder for pictures, which are named as ns-eval names them, or None.
         refine: render from photometrically refined poses.
 
     Returns:
@@ -42,8 +42,6 @@ def measure_reference_views(
     model = run.model
     if run.views is None:
         raise DataError(run.data, "it has no reference images to evaluate on", "ns-render shows what was reconstructed")
-    if output is not None:
-        output.mkdir(exist_ok=True, parents=True)
     was_training = model.training
     model.eval()
     names = picture_names(run.views.image_filenames)
