@@ -60,15 +60,14 @@ class RunRecord:
             state: "training", "finished" or "stopped".
             num_steps: steps that were made.
         """
-        memory: dict[str, int | None] = {
-            "host": 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss,
-            "gpu": torch.cuda.max_memory_allocated() if torch.cuda.is_available() else None,
-        }
         self._record |= {
             "state": state,
             "steps": num_steps,
             "seconds": time.monotonic() - self._began,
-            "peak_memory_bytes": memory,
+            "peak_memory_bytes": {
+                "host": 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss,
+                "gpu": torch.cuda.max_memory_allocated() if torch.cuda.is_available() else None,
+            },
         }
         with atomic_write(self._path) as partial:
             partial.write_text(json.dumps(self._record, indent=2) + "\n", "utf8")
