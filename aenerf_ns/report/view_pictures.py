@@ -55,7 +55,6 @@ def choose_views(psnr: Sequence[float]) -> dict[int, str]:
     return chosen
 
 
-@torch.no_grad()
 def picture_views(run: TrainedRun, indices: Sequence[int]) -> tuple[list[ViewPictures], list[float]]:
     """Render reference views, by their indices, from where they are placed. The run is in evaluation mode.
 
