@@ -98,7 +98,9 @@ def picture_names(files: Sequence[Path]) -> list[str]:
 def view_files(run: TrainedRun) -> list[str]:
     """Return the file of each reference view, relative to the dataset where it lies within."""
     files = [] if run.views is None else run.views.image_filenames
-    return [str(file.relative_to(run.data) if file.is_relative_to(run.data) else file) for file in files]
+    # An event file may stand for its folder. It may be gone by now.
+    folder = run.data if run.data.is_dir() else run.data.parent
+    return [str(file.relative_to(folder) if file.is_relative_to(folder) else file) for file in files]
 
 
 def describe_views(

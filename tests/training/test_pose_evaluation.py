@@ -25,6 +25,7 @@ from aenerf_ns.camera.trajectory import Trajectory, homogeneous
 from aenerf_ns.errors import DataError
 from aenerf_ns.evaluation.pose_refinement import refine_camera
 from aenerf_ns.evaluation.poses import camera_speeds, compare_with_ground_truth
+from aenerf_ns.evaluation.view_metrics import view_files
 from aenerf_ns.files.tum_trajectory import read_tum_trajectory
 from aenerf_ns.method.image_metrics import ImageMetrics
 from aenerf_ns.method.model import AENeRFModel
@@ -233,6 +234,11 @@ def test_ns_render_shows_training_cameras_where_there_are_no_validation_views(
     monkeypatch.setattr("sys.argv", ["ns-render", "dataset", "--split", "val"])
     data = make_pipeline_config(tmp_path / "made", num_views=0).datamanager.setup(device="cpu", test_mode="val")
     assert data.eval_dataset is data.train_dataset
+
+
+def test_files_of_views_are_relative_to_the_folder_of_an_event_file(tmp_path: Path) -> None:
+    views = SimpleNamespace(image_filenames=[tmp_path / "images" / "0.png"])
+    assert view_files(SimpleNamespace(data=tmp_path / "events.raw", views=views)) == ["images/0.png"]
 
 
 def test_ground_truth_must_overlap_the_estimated_poses(random_poses: torch.Tensor) -> None:
