@@ -5,8 +5,7 @@ import os
 import resource
 import time
 import zlib
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
 
 from aenerf_ns.errors import DataError
@@ -20,30 +19,21 @@ MAX_BYTES, MAX_SECONDS, _MAX_UNPACKED = 1 << 30, 2.0, 2 << 30
 codecs.lookup("ascii")
 
 
-@contextmanager
-def without_rights_of_root() -> Iterator[None]:
-    """Root may read everything."""
-    user = os.geteuid()
-    if user == 0:
-        os.seteuid(65534)
-    try:
-        yield
-    finally:
-        os.seteuid(user)
-
-
 def refusal(read: Callable[[], object], max_seconds: float = MAX_SECONDS) -> str:
     """Read in little memory and time, and return the line of the error, or nothing where there is none."""
     begin, message = time.process_time(), ""
     size = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
-    before = resource.getrlimit(resource.RLIMIT_AS)
+    user, before = os.geteuid(), resource.getrlimit(resource.RLIMIT_AS)
     resource.setrlimit(resource.RLIMIT_AS, (size + MAX_BYTES, before[1]))
     try:
-        with without_rights_of_root():
-            read()
+        if user == 0:
+            # Root may read everything.
+            os.seteuid(65534)
+        read()
     except DataError as error:
         message = str(error)
     finally:
+        os.seteuid(user)
         resource.setrlimit(resource.RLIMIT_AS, before)
     assert len(message) < 800
     seconds = time.process_time() - begin
