@@ -233,7 +233,7 @@ def test_refuse_a_colmap_model_that_does_not_fit_the_images(placed: Truth) -> No
     without = text.replace("\n\n", "\n")
     for lines in (without, without.replace(" 1 0", " 1 my image 0")):
         model.write_text(lines)
-        with pytest.raises(DataError, match=r"line 2 holds no features .*; write the features of an image, or an"):
+        with pytest.raises(DataError, match=r"line 6 holds no features .*; write the features of an image, or an"):
             opened(placed)
     model.write_text(text)
     listed.write_text("".join(f"7.5 {line.split()[1]}\n" for line in listed.read_text().splitlines()))

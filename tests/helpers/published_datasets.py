@@ -8,6 +8,7 @@ from pathlib import Path
 
 import h5py
 import numpy as np
+import pycolmap
 import torch
 from numpy.typing import NDArray
 from PIL import Image
@@ -316,18 +317,16 @@ CAMCHAIN = {
 }  # fmt: skip
 
 
-def write_colmap(folder: Path, poses: NDArray[np.float64], names: list[str]) -> None:
-    """COLMAP's text model: world-to-camera, qw first."""
-    folder.mkdir(parents=True)
-    (folder / "cameras.txt").write_text("1 PINHOLE 60 40 50 51 30 20.5\n")
-    lines = []
+def write_colmap(folder: Path, poses: NDArray[np.float64], names: list[str], binary: bool = False) -> None:
+    """Write a model in COLMAP's text format, or in its binary one, where each image has two features."""
+    model = pycolmap.Reconstruction()
+    camera = pycolmap.Camera(camera_id=1, model="PINHOLE", width=60, height=40, params=[50, 51, 30, 20.5])
+    model.add_camera_with_trivial_rig(camera)
     for index, (pose, name) in enumerate(zip(poses, names, strict=True), start=1):
-        inverse = np.linalg.inv(pose)
-        x, y, z, w = Rotation.from_matrix(inverse[:3, :3]).as_quat().tolist()
-        values = [w, x, y, z, *inverse[:3, 3].tolist()]
-        lines.append(f"{index} {' '.join(map(repr, values))} 1 {name}\n\n")
-    (folder / "images.txt").write_text("".join(lines))
-    (folder / "points3D.txt").write_text("")
+        image = pycolmap.Image(name=name, keypoints=np.ones((2 * binary, 2)), camera_id=1, image_id=index)
+        model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(np.linalg.inv(pose)[:3]))
+    folder.mkdir(parents=True)
+    (model.write_binary if binary else model.write_text)(folder)
 
 
 WRITERS: dict[str, Callable[[Path], Truth]] = {

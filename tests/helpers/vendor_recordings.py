@@ -11,7 +11,6 @@ from pathlib import Path
 
 import numpy as np
 import yaml
-from scipy.spatial.transform import Rotation
 
 from aenerf_ns.dataparsers.own_recording import OwnRecordingDataParserConfig
 from helpers.bag_writers import ARRAY, PACKET, array_message, packet_messages, write_bag, write_bag2
@@ -19,7 +18,7 @@ from helpers.dataset_faults import Change, all_of, edit_bytes, read_everything, 
 from helpers.event_file_writers import HEIGHT, WIDTH, Rows, aedat4_file, aedat4_packet, dat, evt2, evt3, flat_table
 from helpers.malformed_inputs import FORMAT_WRITERS, camchain
 from helpers.own_recordings import write_calibration, write_poses
-from helpers.published_datasets import CAMCHAIN, config_of, write_own
+from helpers.published_datasets import CAMCHAIN, config_of, write_colmap, write_own
 
 # From 0.1 to 0.7 s, four events a pixel.
 ROWS: Rows = [(x % 30, 5 + x % 3, 100_000 + 5000 * x, 1 - 2 * (x // 30 % 2)) for x in range(120)]
@@ -73,15 +72,8 @@ def write_with_colmap(folder: Path) -> None:
     """A recording whose poses are COLMAP's, in its binary format."""
     truth = write_own(folder)
     (folder / "trajectory.txt").unlink()
-    (folder / "colmap").mkdir()
-    images = []
-    for index in range(3):
-        world_to_camera = np.linalg.inv(truth.poses[5 * index])
-        x, y, z, w = Rotation.from_matrix(world_to_camera[:3, :3]).as_quat()
-        head = struct.pack("<I7dI", index + 1, w, x, y, z, *world_to_camera[:3, 3], 1)
-        features = struct.pack("<Q", 2) + struct.pack("<2dQ", 1.0, 2.0, 3) * 2
-        images.append(head + f"{index:05d}.png\0".encode() + features)
-    (folder / "colmap" / "images.bin").write_bytes(struct.pack("<Q", len(images)) + b"".join(images))
+    names = [f"{index:05d}.png" for index in range(3)]
+    write_colmap(folder / "colmap", truth.poses[[0, 5, 10]], names, binary=True)
 
 
 def write_with_camchain(folder: Path) -> None:
