@@ -48,7 +48,7 @@ def edit_bytes(pattern: str, edit: Callable[[bytes], bytes]) -> Change:
     return change
 
 
-def sparse(pattern: str, begin: bytes | None = None, end: bytes = b"", gigabytes: int = 8) -> Change:
+def sparse(pattern: str, begin: bytes | None = None, end: bytes = b"", gigabytes: float = 8) -> Change:
     """Put zeros, which take no room on the disk, behind a file or behind a beginning."""
 
     def change(folder: Path) -> None:
@@ -58,7 +58,7 @@ def sparse(pattern: str, begin: bytes | None = None, end: bytes = b"", gigabytes
                 file.truncate(0)
                 file.write(begin)
             # Words and records stay whole.
-            file.truncate(file.seek(0, 2) + (gigabytes << 30))
+            file.truncate(file.seek(0, 2) + int(gigabytes * (1 << 30)))
             file.seek(0, 2)
             file.write(end)
 
