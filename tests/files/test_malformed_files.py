@@ -71,7 +71,6 @@ FAULTS: dict[str, tuple[bytes | Callable[[Path], object], str]] = {
     "raw: evt3 beside the sensor": (evt3_of(0x8001, 0x6000, 0x0030, 0x2001), "y = 48 on a sensor of height"),
     "raw: evt3 vectors that never end": (evt3_of(0x8001, 0x6000, 1, 0x3000, *[0x4001] * 6000), "on a sensor of width"),
     "raw: empty": (b"", "the file is empty"),
-    "raw: unknown": (b"RIFF....WAVE", "its format is not known"),
     "raw: packed": (b"\x1f\x8b" + bytes(30), "its format is not known .* csv and text are read, unpacked"),
     "bag: of version 1": (b"#ROSBAG V1.2\n", "not a readable bag"),
     "bag: without an index": (

@@ -21,7 +21,7 @@ from helpers.dataset_faults import (
     write_bytes,
     write_text,
 )
-from helpers.malformed_inputs import OBJECTS, camchain, camera
+from helpers.malformed_inputs import OBJECTS, camchain, camera, unallocated
 from helpers.published_datasets import CAMCHAIN, N_POSES, make_poses, write_colmap
 
 # Each fault: a change of the dataset, the end of the path that the error names, and words of its problem or remedy.
@@ -76,6 +76,7 @@ _NATIVE_FAULTS: dict[str, Fault] = {
     "no column": (column("p", None), "events.h5", "/events/p"),
     "wrong dtype": (column("t", np.zeros(200)), "events.h5", "/events/t has type float64"),
     "no events": (all_of(*(column(n, np.zeros(0, dtype)) for n, dtype in DTYPES.items())), "events.h5", "no events"),
+    "10^12 rows": (unallocated("events.h5", DTYPES, "events/"), "events.h5", "unpacks to 13,000,000,000,000 bytes"),
     "fractional offset": (set_attribute("time_offset", 0.5), "events.h5", "time_offset is 0.5"),
     "offset is NaN": (set_attribute("time_offset", np.nan), "events.h5", "time_offset is nan"),
     "unknown unit": (set_attribute("time_unit", "fortnight"), "events.h5", "time unit is 'fortnight'"),
