@@ -8,7 +8,7 @@ from typing import Any
 import h5py
 import numpy as np
 import pytest
-from helpers.bag_writers import message_header, string
+from helpers.bag_writers import message_header, string, typestore
 from helpers.examples import run_example
 from helpers.published_datasets import (
     EPOCH,
@@ -116,8 +116,7 @@ def test_vector(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.parametrize("encoding", ["mono8", "rgb8", "bgr8"])
 def test_frames_of_a_bag(encoding: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    rosbag1, typesys = pytest.importorskip("rosbags.rosbag1"), pytest.importorskip("rosbags.typesys")
-    store = typesys.get_typestore(typesys.Stores.ROS1_NOETIC)
+    rosbag1 = pytest.importorskip("rosbags.rosbag1")
     monkeypatch.chdir(tmp_path)
     Path("recording").mkdir()
     # Two frames of 3 x 2 gray pixels or 1 x 2 colors, whose rows are padded to 4 bytes. images/ is there already.
@@ -125,7 +124,7 @@ def test_frames_of_a_bag(encoding: str, tmp_path: Path, monkeypatch: pytest.Monk
     frames = np.arange(16, dtype=np.uint8).reshape(2, 2, 4)
     stamps = [EPOCH * 1_000 + 7, EPOCH * 1_000 + 40_000_007]
     with rosbag1.Writer(Path("recording/events.bag")) as writer:
-        pictures = writer.add_connection("/dvs/image_raw", "sensor_msgs/msg/Image", typestore=store)
+        pictures = writer.add_connection("/dvs/image_raw", "sensor_msgs/msg/Image", typestore=typestore("ROS1_NOETIC"))
         for stamp, frame in zip(stamps, frames, strict=True):
             end = string(encoding) + b"\0" + struct.pack("<2I", 4, frame.size) + frame.tobytes()
             writer.write(pictures, stamp, message_header(stamp, (3 if encoding == "mono8" else 1, 2)) + end)

@@ -26,6 +26,9 @@ from aenerf_ns.errors import DataError
 from aenerf_ns.files import event_reader
 from aenerf_ns.files.open import open_event_file
 
+# A message with one event.
+ONE = [(START, array_message([(1, 2, START // 1000, 1)]))]
+
 
 @pytest.mark.parametrize("compress", ["", "LZ4", "BZ2"])
 def test_arrays_of_events_in_a_bag(compress: str, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -167,7 +170,7 @@ def test_packets_of_ros2_equal_those_of_ros1(folder: Path) -> None:
 
 
 def test_bag_of_ros2_without_metadata_opens(folder: Path) -> None:
-    path = write_bag2(folder / "gone", [(START, array_message([(1, 2, START // 1000, 1)]))], ARRAY)
+    path = write_bag2(folder / "gone", ONE, ARRAY)
     file = open_event_file(path, WIDTH, HEIGHT)
     assert len(read(file)) == 1
     (path / "metadata.yaml").unlink()
@@ -176,7 +179,7 @@ def test_bag_of_ros2_without_metadata_opens(folder: Path) -> None:
 
 
 def test_a_part_of_a_bag_of_ros2_is_refused(folder: Path) -> None:
-    path = write_bag2(folder / "split", [(START, array_message([(1, 2, START // 1000, 1)]))], ARRAY)
+    path = write_bag2(folder / "split", ONE, ARRAY)
     (stored,) = path.glob("*.db3")
     metadata = path / "metadata.yaml"
     metadata.write_text(metadata.read_text().replace(f"- {stored.name}", f"- {stored.name}\n  - other.db3", 1))
@@ -186,9 +189,7 @@ def test_a_part_of_a_bag_of_ros2_is_refused(folder: Path) -> None:
 
 
 def test_an_interrupted_bag_can_be_repaired(folder: Path) -> None:
-    (stored,) = write_bag2(folder / "cut", [(START, array_message([(1, 2, START // 1000, 1)]))], ARRAY, "MCAP").glob(
-        "*.mcap"
-    )
+    (stored,) = write_bag2(folder / "cut", ONE, ARRAY, "MCAP").glob("*.mcap")
     alone = folder / "alone.mcap"
     alone.write_bytes(stored.read_bytes()[:-20])
     with pytest.raises(
@@ -199,7 +200,7 @@ def test_an_interrupted_bag_can_be_repaired(folder: Path) -> None:
 
 @pytest.mark.parametrize("cut", [1, 10, 30, 61])
 def test_cut_message_of_ros2_is_one_line(cut: int, folder: Path) -> None:
-    path = write_bag2(folder / "cut", [(START, array_message([(1, 2, START // 1000, 1)]))], ARRAY)
+    path = write_bag2(folder / "cut", ONE, ARRAY)
     (stored,) = path.glob("*.db3")
     with closing(sqlite3.connect(stored)) as database, database:
         (data,) = database.execute("SELECT data FROM messages").fetchone()
@@ -213,8 +214,7 @@ def test_cut_message_of_ros2_is_one_line(cut: int, folder: Path) -> None:
 
 
 def test_choose_a_topic(folder: Path) -> None:
-    array = [(START, array_message([(1, 2, START // 1000, 1)]))]
-    path = write_bag(folder / "topics.bag", {"/left": (ARRAY, array), "/right": (ARRAY, array)})
+    path = write_bag(folder / "topics.bag", {"/left": (ARRAY, ONE), "/right": (ARRAY, ONE)})
     with pytest.raises(DataError, match="choose one of /left, /right as topic"):
         open_event_file(path)
     assert len(read(open_event_file(path, topic="/right"))) == 1

@@ -2,6 +2,7 @@
 
 import shutil
 import struct
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -9,33 +10,16 @@ import pytest
 
 from helpers.event_file_writers import HEIGHT, WIDTH, Rows, evt3_words
 
-_HEADER_DEFINITION = f"""{"=" * 80}
-MSG: std_msgs/Header
-uint32 seq
-time stamp
-string frame_id
-"""
-_ARRAY_DEFINITION = f"""std_msgs/Header header
-uint32 height
-uint32 width
-dvs_msgs/Event[] events
-{_HEADER_DEFINITION}{"=" * 80}
-MSG: dvs_msgs/Event
-uint16 x
-uint16 y
-time ts
-bool polarity
-"""
-_PACKET_DEFINITION = f"""std_msgs/Header header
-uint32 height
-uint32 width
-uint64 seq
-uint64 time_base
-string encoding
-bool is_bigendian
-uint8[] events
-{_HEADER_DEFINITION}"""
 ARRAY, PACKET = "dvs_msgs/msg/EventArray", "event_camera_msgs/msg/EventPacket"
+_BEGINNING = "std_msgs/Header header\nuint32 height\nuint32 width\n"
+_PACKET_DEFINITION = f"{_BEGINNING}uint64 seq\nuint64 time_base\nstring encoding\nbool is_bigendian\nuint8[] events"
+_DEFINITIONS = {
+    "dvs_msgs/msg/Event": "uint16 x\nuint16 y\nbuiltin_interfaces/Time ts\nbool polarity",
+    ARRAY: f"{_BEGINNING}dvs_msgs/Event[] events",
+    PACKET: _PACKET_DEFINITION,
+    # The earlier name of packets.
+    "event_array_msgs/msg/EventArray": _PACKET_DEFINITION,
+}
 # The clock of ROS.
 START = 1_600_000_000_000_000_000
 
@@ -68,14 +52,14 @@ def packet_message(sequence: int, stamp: int, payload: bytes, encoding: str = "e
 def write_bag(path: Path, topics: dict[str, tuple[str, list[tuple[int, bytes]]]], compress: str = "") -> Path:
     """Writes (time, message) by type by topic."""
     rosbag1 = pytest.importorskip("rosbags.rosbag1")
+    store = typestore("ROS1_NOETIC")
     path.unlink(missing_ok=True)
     writer = rosbag1.Writer(path)
     if compress:
         writer.set_compression(rosbag1.Writer.CompressionFormat[compress])
     with writer:
         for topic, (kind, messages) in topics.items():
-            definition = _PACKET_DEFINITION if kind.startswith("event_") else _ARRAY_DEFINITION
-            connection = writer.add_connection(topic, kind, msgdef=definition, md5sum="0" * 32)
+            connection = writer.add_connection(topic, kind, typestore=store)
             for time, data in messages:
                 writer.write(connection, time, data)
     return path
@@ -100,13 +84,10 @@ def packet_messages(rows: Rows, times_of_arrival: list[int], words_per_packet: i
     ]
 
 
-# ROS 2. Its messages are serialized by rosbags, from the definitions above without the header's sequence number.
-
-
 def write_bag2(path: Path, messages: list[tuple[int, bytes]], kind: str, storage: str = "SQLITE3") -> Path:
     """Write messages of ROS 1 as a bag of ROS 2, a folder, with one topic /events."""
     rosbag2 = pytest.importorskip("rosbags.rosbag2")
-    store = typestore()
+    store = typestore("ROS2_HUMBLE")
     shutil.rmtree(path, ignore_errors=True)
     with rosbag2.Writer(path, version=9, storage_plugin=rosbag2.StoragePlugin[storage]) as writer:
         connection = writer.add_connection("/events", kind, typestore=store)
@@ -115,12 +96,12 @@ def write_bag2(path: Path, messages: list[tuple[int, bytes]], kind: str, storage
     return path
 
 
-def typestore() -> Any:
-    """The types of ROS 2 and those of events."""
+@cache
+def typestore(version: str) -> Any:
+    """The types of a version of ROS, and those of events."""
     from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-    store = get_typestore(Stores.ROS2_HUMBLE)
-    for definition, kind in ((_ARRAY_DEFINITION, ARRAY), (_PACKET_DEFINITION, PACKET)):
-        own = get_types_from_msg(definition.replace("time ts", "builtin_interfaces/Time ts"), kind)
-        store.register({name: fields for name, fields in own.items() if not name.startswith("std_msgs")})
+    store = get_typestore(Stores[version])
+    for kind, definition in _DEFINITIONS.items():
+        store.register(get_types_from_msg(definition, kind))
     return store
