@@ -1,20 +1,19 @@
 """Event streams, pairing, the sensor model and event pictures."""
 
 import tempfile
-from dataclasses import fields
 from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-from helpers.streams import EventsInMemory, make_stream, sorted_rows, unpacked
+from helpers.streams import EventsInMemory, assert_same_pairs, make_stream, sorted_rows, unpacked
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from aenerf_ns.camera.time_window import TimeWindow
 from aenerf_ns.errors import DataError
-from aenerf_ns.events.pair_store import EventPairs, event_counts, own_counts
+from aenerf_ns.events.pair_store import event_counts, own_counts
 from aenerf_ns.events.pairing import pair_events
 from aenerf_ns.events.picture import polarity_picture
 from aenerf_ns.events.sensor import SensorModel
@@ -95,8 +94,7 @@ def test_pairs_are_those_of_brute_force_however_the_stream_is_cut(
             open_file=lambda: (file, Path(folder)),
             events_in_memory=in_memory,
         )
-        for field in fields(EventPairs):
-            assert np.array_equal(getattr(in_file, field.name), getattr(pairs, field.name))
+        assert_same_pairs(in_file, pairs)
 
 
 @settings(max_examples=200, deadline=None)

@@ -2,6 +2,7 @@
 
 import os
 from collections.abc import Iterator, Sequence
+from dataclasses import fields
 from pathlib import Path
 
 import numpy as np
@@ -53,6 +54,11 @@ class EventsInMemory(EventFile):
 
     def require(self) -> None:
         pass
+
+
+def assert_same_pairs(first: EventPairs, second: EventPairs) -> None:
+    for field in fields(EventPairs):
+        assert np.array_equal(getattr(first, field.name), getattr(second, field.name)), field.name
 
 
 def unpacked(pairs: EventPairs) -> list[tuple[int, ...]]:

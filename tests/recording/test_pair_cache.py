@@ -4,7 +4,6 @@ import fcntl
 import os
 import socket
 from collections.abc import Callable, Iterator
-from dataclasses import fields
 from itertools import islice
 from pathlib import Path
 
@@ -12,11 +11,11 @@ import numpy as np
 import pytest
 import torch
 from helpers.small_datasets import parse, write_native
+from helpers.streams import assert_same_pairs
 
 from aenerf_ns.dataparsers.native import NativeDataParserConfig
 from aenerf_ns.errors import DataError
 from aenerf_ns.events import pairing
-from aenerf_ns.events.pair_store import EventPairs
 from aenerf_ns.events.stream import EventStream
 from aenerf_ns.files.event_hdf5 import Hdf5EventFile
 from aenerf_ns.recording.dataset import EventDataset
@@ -62,21 +61,16 @@ def opened(folder: Path, **options: int) -> EventDataset:
     return EventDataset(parse(NativeDataParserConfig(data=folder, **options)))
 
 
-def assert_same(first: EventPairs, second: EventPairs) -> None:
-    for field in fields(EventPairs):
-        assert np.array_equal(getattr(first, field.name), getattr(second, field.name)), field.name
-
-
 def test_pairs_in_file_equal_those_in_memory(data: Path, reads: list[Path], request: pytest.FixtureRequest) -> None:
     in_memory = opened(data)
     assert len(in_memory.pairs) > 100
     assert not (data / KEPT).exists()
     request.getfixturevalue("long_recording")
     made, found = opened(data), opened(data)
-    assert_same(made.pairs, in_memory.pairs)
+    assert_same_pairs(made.pairs, in_memory.pairs)
     assert sorted(path.name for path in data.glob("events*")) == ["events.h5", KEPT]
     assert len(reads) == 2
-    assert_same(found.pairs, in_memory.pairs)
+    assert_same_pairs(found.pairs, in_memory.pairs)
     for camera in range(len(made)):
         assert np.array_equal(found.get_numpy_image(camera), in_memory.get_numpy_image(camera))
     assert len(reads) == 2
@@ -132,7 +126,7 @@ def test_broken_file_is_made_again(
     (data / KEPT).unlink()
     (data / KEPT).write_bytes(damage(content))
     capsys.readouterr()
-    assert_same(opened(data).pairs, pairs)
+    assert_same_pairs(opened(data).pairs, pairs)
     assert "events.h5.pairs is not whole" in " ".join(capsys.readouterr().out.split())
     assert len(long_recording) == 2
     assert (data / KEPT).read_bytes() == content
@@ -182,7 +176,7 @@ def test_hosts_do_not_share_a_file(data: Path, long_recording: list[Path], monke
         patch.setattr(PairFile, "_read", lambda *_: pytest.fail("the other host's file is read"))
         pairs = opened(data).pairs
     ((other, inode),) = others
-    assert_same(pairs, other)
+    assert_same_pairs(pairs, other)
     assert (data / KEPT).stat().st_ino == inode
     assert sorted(path.name for path in data.glob("events*")) == ["events.h5", KEPT]
 
@@ -208,7 +202,7 @@ def test_unwritable_folder_is_left_alone(
     out = " ".join(capsys.readouterr().out.split())
     assert "cannot be written to (Permission denied): the pairs are in" in out
     assert [path.name for path in data.glob("events*")] == ["events.h5"]
-    assert_same(opened(data).pairs, first)
+    assert_same_pairs(opened(data).pairs, first)
     assert len(long_recording) == 2
 
 
