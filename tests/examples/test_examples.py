@@ -59,8 +59,7 @@ def test_format_of_your_own(tmp_path: Path) -> None:
     )
     poses = "".join(f"{0.1 * i:.1f} {0.1 * i:.1f} 0 -2 0 0 0 1\n" for i in range(11))
     (tmp_path / "poses.txt").write_text(poses)
-    module = run_example("npz_format")
-    config = module["npz_dataparser"].config  # type: ignore[attr-defined]
+    config = run_example("npz_format")["npz_dataparser"].config
     config.data = tmp_path
     dataset = EventDataset(parse(config))
     assert dataset.pairs.num_events == 500

@@ -1,13 +1,12 @@
 """Run the files in examples/."""
 
+import runpy
 from pathlib import Path
+from typing import Any
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 
 
-def run_example(name: str) -> dict[str, object]:
+def run_example(name: str) -> dict[str, Any]:
     """Return the names that a script defines when it is started in the current folder."""
-    # A configuration's class is found by the name of its module.
-    names: dict[str, object] = {"__name__": "__main__"}
-    exec(compile((EXAMPLES / f"{name}.py").read_text(encoding="utf-8"), name, "exec"), names)
-    return names
+    return runpy.run_path(str(EXAMPLES / f"{name}.py"), run_name="__main__")
