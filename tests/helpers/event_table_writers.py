@@ -22,12 +22,12 @@ def made_columns() -> Columns:
     }
 
 
-def write_dsec(path: Path, columns: Columns, **filters: object) -> None:
+def write_dsec(path: Path, columns: Columns) -> None:
     offset = int(columns["t"][0]) - 7
     with h5py.File(path, "w") as file:
         for name, values in columns.items():
             values = (values - offset).astype(np.uint32) if name == "t" else values
-            file.create_dataset(f"events/{name}", data=values, **filters)
+            file[f"events/{name}"] = values
         file["ms_to_idx"] = np.zeros(3, np.uint64)
         file["t_offset"] = offset
 

@@ -6,7 +6,6 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import h5py
 import numpy as np
 import pycolmap
 import torch
@@ -194,10 +193,7 @@ def write_tum_vie(
     times -= times % 1_000
     write_poses(truth / "mocap_data.txt", markers, (times // 1_000).astype(str).tolist(), "# timestamp[us] p q\n")
     events = make_events(1280, 720, EPOCH)
-    with h5py.File(folder / f"{sequence}-events_{side}.h5", "w") as file:
-        for name, values in unsigned(events).items():
-            file[f"events/{name}"] = values
-        file["ms_to_idx"] = np.zeros(3, np.uint64)
+    event_table_writers.write_tum_vie(folder / f"{sequence}-events_{side}.h5", unsigned(events))
     write_images(truth / f"{side}_images", 3, (1024, 1024), "{:05d}.jpg")
     stamps = [EPOCH + 100_000, EPOCH + 333_333, EPOCH + 1_900_000]
     (truth / f"{side}_images" / f"image_timestamps_{side}.txt").write_text("\n".join(map(str, stamps)) + "\n")

@@ -3,12 +3,11 @@
 from collections.abc import Callable
 from pathlib import Path
 
-import h5py
 import numpy as np
 import pytest
 import tyro
+from helpers.event_table_writers import Columns, write_eds
 from helpers.own_recordings import random_events, write_calibration, write_poses
-from numpy.typing import NDArray
 
 from aenerf_ns.cli.convert import Convert
 from aenerf_ns.dataparsers.ecd import EcdDataParserConfig
@@ -16,13 +15,10 @@ from aenerf_ns.dataparsers.own_recording import OwnRecordingDataParserConfig
 from aenerf_ns.errors import DataError
 from aenerf_ns.recording.dataset import EventDataset
 
-Columns = dict[str, NDArray]
-
 
 def write_hdf5(folder: Path, columns: Columns, polarity: type = np.int8) -> None:
-    with h5py.File(folder / "events.h5", "w") as file:
-        for name, dtype in (("x", np.uint16), ("y", np.uint16), ("t", np.int64), ("p", polarity)):
-            file[f"events/{name}"] = columns[name].astype(dtype)
+    dtypes = {"x": np.uint16, "y": np.uint16, "t": np.int64, "p": polarity}
+    write_eds(folder / "events.h5", {f"events/{name}": columns[name].astype(dtype) for name, dtype in dtypes.items()})
 
 
 def write_npz(folder: Path, columns: Columns) -> None:
