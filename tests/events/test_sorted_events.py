@@ -84,11 +84,11 @@ def test_counts_are_those_of_brute_force_with_random_times_at_both_ends(gaps: tu
     usable = rng.random((3, 4)) > 0.2
     events = sort_events((stream[i : i + 70] for i in range(0, 400, 70)), window=window, usable=usable)
     compared = 0
-    for _ in range(300):
+    for _ in range(600):
         # Half of the times are times of events.
         times = np.where(rng.random(2) < 0.5, rng.choice(stream.t, 2), EPOCH + rng.integers(40, 960, 2))
-        start, end = map(int, np.sort(times))
-        if any(first <= start and end <= last for first, last in window.pieces()):
+        start, end = times.tolist()
+        if any(first <= start <= end <= last for first, last in window.pieces()):
             counts = events.counts(start, end)
             np.testing.assert_array_equal(counts, brute_force(stream, start, end, window, usable))
             compared += counts.any()
@@ -100,17 +100,6 @@ def test_counts_are_those_of_brute_force_with_random_times_at_both_ends(gaps: tu
     assert (~window.contains(stream.t)).sum() == events.num_outside > 0
     assert len(events.times) + left_out == 400
     assert f"400 events, {len(events.times)} of them are used" in events.summary()
-
-
-def test_events_at_the_edges_of_a_gap_count_and_those_inside_do_not() -> None:
-    stream = make_stream([(0, 0, t, 1) for t in (10, 20, 21, 39, 40, 50)])
-    events = sort_events([stream], window=TimeWindow(0, 60, ((20, 40),)), usable=ALL)
-    assert events.counts(0, 20)[0, 0] == 2
-    # The event at 40 is at the start of its window, whose change begins after it.
-    assert events.counts(40, 60)[0, 0] == 1
-    for start, end in ((15, 45), (20, 10)):
-        with pytest.raises(ValueError, match="is not inside"):
-            events.counts(start, end)
 
 
 def test_what_cannot_be_counted_is_refused_with_one_line() -> None:
