@@ -59,9 +59,11 @@ WRITERS = {
 }
 
 
-def opened(path: Path) -> EventFile:
+def opened(path: Path, drop_malformed: bool = False) -> EventFile:
     states_size = path.suffix in (".dat", ".aedat4", ".raw", ".bag")
-    return open_event_file(path) if states_size else open_event_file(path, WIDTH, HEIGHT)
+    file = open_event_file(path) if states_size else open_event_file(path, WIDTH, HEIGHT)
+    file.drop_malformed = drop_malformed
+    return file
 
 
 @pytest.mark.parametrize("suffix", WRITERS)
@@ -75,8 +77,7 @@ def test_leave_out_a_few_malformed_events(suffix: str, folder: Path, capsys: pyt
     WRITERS[suffix](path, rows)
     with pytest.raises(DataError, match="drop-malformed"):
         read(opened(path))
-    file = opened(path)
-    file.drop_malformed = True
+    file = opened(path, drop_malformed=True)
     np.testing.assert_array_equal(read(file)[:, 2], [t * 1000 for _, _, t, _ in ROWS])
     assert file.time_span() == (ROWS[0][2] * 1000, ROWS[-1][2] * 1000)
     said = capsys.readouterr().out
@@ -95,9 +96,7 @@ def test_leave_out_the_end_of_an_interrupted_recording(
     if suffix in (".txt", ".csv"):
         with pytest.raises(DataError, match=r"ends within a line at byte .*--drop-malformed"):
             opened(path).time_span()
-    file = opened(path)
-    file.drop_malformed = True
-    times = read(file)[:, 2].tolist()
+    times = read(opened(path, drop_malformed=True))[:, 2].tolist()
     assert times == [t * 1000 for _, _, t, _ in ROWS[: len(times)]]
     assert len(times) >= len(ROWS) - 3
     assert "1 cut off at its end (the first a " in capsys.readouterr().out
@@ -110,10 +109,8 @@ def test_refuse_many_malformed_events(kind: str, suffix: str, folder: Path) -> N
     order = np.random.default_rng(0).permutation(len(ROWS)) if kind == "shuffled" else range(len(ROWS))
     WRITERS[suffix](path, [(x + WIDTH * (kind == "outside"), y, t, p) for x, y, t, p in (ROWS[i] for i in order)])
     for look in (read, lambda file: file.time_span()):
-        file = opened(path)
-        file.drop_malformed = True
         with pytest.raises(DataError, match=r"of its 5,000 events are malformed.*only a thousandth"):
-            look(file)
+            look(opened(path, drop_malformed=True))
 
 
 @pytest.mark.parametrize("columns", ["txyp", "xytp", "xypt"])
@@ -125,9 +122,8 @@ def test_a_malformed_event_hides_no_order_of_the_columns(suffix: str, columns: s
     rows.insert(100, (WIDTH + 500, 1, ROWS[100][2], -1))
     separator = "," if suffix == ".csv" else " "
     path.write_text("".join(separator.join(str(row["xytp".index(name)]) for name in columns) + "\n" for row in rows))
-    file = opened(path)
-    file.drop_malformed = True
-    np.testing.assert_array_equal(read(file), [(x, y, t * 1000, p) for x, y, t, p in ROWS[:300]])
+    found = read(opened(path, drop_malformed=True))
+    np.testing.assert_array_equal(found, [(x, y, t * 1000, p) for x, y, t, p in ROWS[:300]])
 
 
 def test_leave_out_events_between_the_files_of_a_folder(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -149,8 +145,7 @@ def test_late_times_at_the_end_of_a_chunk_cost_no_later_event(
     monkeypatch.setattr("aenerf_ns.files.event_table.CHUNK", 1000)
     rows = [(x, y, t + 10**6 * (1000 - number <= i < 1000), p) for i, (x, y, t, p) in enumerate(ROWS)]
     WRITERS[".npz"](folder / "late.npz", rows)
-    file = opened(folder / "late.npz")
-    file.drop_malformed = True
+    file = opened(folder / "late.npz", drop_malformed=True)
     expected = [t * 1000 for _, _, t, _ in ROWS[: 1000 - number] + ROWS[1000:]]
     np.testing.assert_array_equal(read(file)[:, 2], expected)
     assert file.time_span() == (expected[0], expected[-1])
