@@ -14,6 +14,7 @@ import torch
 from helpers.commands import simulate
 from helpers.dataset_faults import edit_json, set_in
 from helpers.own_recordings import random_events, write_calibration, write_poses
+from helpers.small_datasets import read_native
 from nerfstudio.utils.rich_utils import CONSOLE
 from PIL import Image
 
@@ -27,7 +28,6 @@ from aenerf_ns.checking.pose_checks import check_poses
 from aenerf_ns.checking.report import check
 from aenerf_ns.cli.check import Check
 from aenerf_ns.cli.convert import Convert
-from aenerf_ns.dataparsers.native import NativeDataParserConfig
 from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.events.stream import EventStream
 from aenerf_ns.files.event_hdf5 import Hdf5EventWriter
@@ -51,13 +51,9 @@ def all_events(recording: Recording) -> EventStream:
     return EventStream.concatenate(list(recording.event_file.chunks()))
 
 
-def open_native(folder: Path) -> Recording:
-    return NativeDataParserConfig(data=folder).setup().read_recording()
-
-
 @pytest.fixture(scope="module")
 def simulated(room: Path) -> tuple[Recording, EventStream]:
-    recording = open_native(room)
+    recording = read_native(room)
     return recording, all_events(recording).between(0, PART)
 
 
@@ -142,7 +138,7 @@ def run(folder: Path, *, status: int | None = None, **options: Any) -> str:
 # What is left of each column is that of the recording. To permute all but the times is to permute the times.
 @pytest.mark.parametrize("columns", ["p", "xy", "xyp"])
 def test_reject_noise(columns: str, shorter: Path) -> None:
-    events = all_events(open_native(shorter))
+    events = all_events(read_native(shorter))
     order = np.random.default_rng(0).permutation(len(events))
     rewrite(shorter, replace(events, **{name: getattr(events, name)[order] for name in columns}))
     output = run(shorter, status=1)
@@ -158,7 +154,7 @@ def test_reject_poses_of_another_path(shorter: Path) -> None:
 def shorter(room: Path, tmp_path: Path) -> Path:
     """The simulated room with a part of its events."""
     folder = shutil.copytree(room, tmp_path / "room")
-    rewrite(folder, all_events(open_native(folder)).between(0, PART))
+    rewrite(folder, all_events(read_native(folder)).between(0, PART))
     return folder
 
 
@@ -181,7 +177,7 @@ def test_command_finds_nothing_and_draws_a_picture(shorter: Path, tmp_path: Path
     set_in("transforms.json", "event_camera", "positive_contrast_threshold", value=0.4)(shorter)
     output = run(shorter, status=0, picture=tmp_path / "warped.png")
     assert "No problems found" in output
-    count = len(all_events(open_native(shorter)))
+    count = len(all_events(read_native(shorter)))
     assert f"Events: {count:,} in 1." in output
     assert "Events with a pose: 100.0%" in output
     assert "Within the scene box: 100" in output
@@ -197,7 +193,7 @@ def test_command_finds_nothing_and_draws_a_picture(shorter: Path, tmp_path: Path
 
 
 def test_command_names_reversed_polarities_and_a_small_scene_box(shorter: Path) -> None:
-    events = all_events(open_native(shorter))
+    events = all_events(read_native(shorter))
     rewrite(shorter, replace(events, p=-events.p))
     set_in("transforms.json", "scene_box", value=[[-0.5] * 3, [0.5] * 3])(shorter)
     set_in("transforms.json", "event_camera", "positive_contrast_threshold", value=0.4)(shorter)
@@ -214,7 +210,7 @@ def test_command_names_reversed_polarities_and_a_small_scene_box(shorter: Path) 
 def test_command_names_mistakes_and_remedies(room: Path, shorter: Path) -> None:
     change_poses(shorter, torch.linalg.inv)
     # Slices are long where a hot pixel is sharp in all of them.
-    events = all_events(open_native(room)).between(0, 2 * PART)
+    events = all_events(read_native(room)).between(0, 2 * PART)
     rng = np.random.default_rng(0)
     t = np.concatenate([events.t, np.sort(rng.integers(0, 2 * PART, 6000))])
     order = np.argsort(t, kind="stable")
@@ -236,7 +232,7 @@ def test_command_reports_gaps_and_missing_poses(shorter: Path) -> None:
     poses = read_tum_trajectory(path)
     kept = (poses.times < 200_000_000) | ((poses.times > 400_000_000) & (poses.times < 560_000_000))
     write_tum_trajectory(path, Trajectory(poses.times[kept], poses.camera_to_worlds[kept]))
-    events = all_events(open_native(shorter))
+    events = all_events(read_native(shorter))
     one = np.ones(len(events), np.int8)
     rewrite(shorter, EventStream(events.x, events.y, events.t, one, 64, 48))
     output = run(shorter, status=1)
@@ -434,7 +430,7 @@ def test_a_part_of_the_sensor_may_have_its_principal_point_anywhere(shorter: Pat
 
 
 def test_a_lens_that_ends_before_the_events_is_named(shorter: Path) -> None:
-    events = all_events(open_native(shorter))
+    events = all_events(read_native(shorter))
     rewrite(shorter, events[events.x < 12])
     edit_json("transforms.json", lambda meta: meta["event_camera"].update(k1=-20.0))(shorter)
     output = run(shorter, status=1)
@@ -443,7 +439,7 @@ def test_a_lens_that_ends_before_the_events_is_named(shorter: Path) -> None:
 
 def test_one_slice_gives_no_verdict(room: Path, tmp_path: Path) -> None:
     folder = shutil.copytree(room, tmp_path / "room")
-    rewrite(folder, all_events(open_native(folder))[:3500])
+    rewrite(folder, all_events(read_native(folder))[:3500])
     change_poses(folder, lambda poses: poses @ OPENCV_TO_OPENGL)
     set_in("transforms.json", "scene_box", value=[[-0.5] * 3, [0.5] * 3])(folder)
     output = run(folder)

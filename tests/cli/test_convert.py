@@ -12,7 +12,7 @@ from helpers.colmap_stand_in import FOUND_BOX, place_frames
 from helpers.dataset_faults import MOUNTED_APART, OTHER_LENS, Change
 from helpers.event_file_checks import read
 from helpers.own_recordings import random_events, write_calibration, write_poses
-from helpers.small_datasets import END, START, make_trajectory, write_ecd, write_native
+from helpers.small_datasets import END, START, make_trajectory, read_native, write_ecd, write_native
 from helpers.streams import random_stream
 from nerfstudio.utils.rich_utils import CONSOLE
 from PIL import Image
@@ -35,7 +35,7 @@ from aenerf_ns.recording.writer import NativeDatasetWriter
 
 def convert(data: Path, output: Path, **options: object) -> Recording:
     Convert(data, output, **options).main()
-    return NativeDataParserConfig(data=output).setup().read_recording()
+    return read_native(output)
 
 
 def assert_same(one: Recording, other: Recording) -> None:
@@ -66,7 +66,7 @@ def test_native_dataset_converts_to_itself(box: np.ndarray | None, tmp_path: Pat
     noisy = perturb(make_trajectory(), 1.0, 0.02, 0.2, 0)
     write_tum_trajectory(data / "trajectory_estimated.txt", noisy)
     after = convert(data, tmp_path / "converted")
-    assert_same(NativeDataParserConfig(data=data).setup().read_recording(), after)
+    assert_same(read_native(data), after)
     assert (box is None) == (after.scene_box is None)
     if box is not None and after.scene_box is not None:
         np.testing.assert_array_equal(after.scene_box.numpy(), box)
@@ -106,13 +106,13 @@ def test_frame_camera_and_images_are_carried_over(native: Path, tmp_path: Path) 
             meta[f"{split}_filenames"] = [new if name == old else name for name in meta[f"{split}_filenames"]]
         frame["file_path"] = new
     (native / "transforms.json").write_text(json.dumps(meta))
-    before = NativeDataParserConfig(data=native).setup().read_recording()
+    before = read_native(native)
     assert before.frame_camera.lens_model == "fisheye"
     assert_same(before, convert(native, tmp_path / "converted"))
 
 
 def test_alpha_is_composed_with_the_background(native: Path, tmp_path: Path) -> None:
-    recording = NativeDataParserConfig(data=native).setup().read_recording()
+    recording = read_native(native)
     pixels = np.zeros((4, 6, 4), np.uint8)
     pixels[:, 3:] = (255, 0, 0, 255)
     pixels[0, 0] = (0, 0, 0, 51)
@@ -132,7 +132,7 @@ def test_alpha_is_composed_with_the_background(native: Path, tmp_path: Path) -> 
 
 
 def test_filters_cut_everything(native: Path, tmp_path: Path) -> None:
-    before = NativeDataParserConfig(data=native).setup().read_recording()
+    before = read_native(native)
     start, end = START + 100_000_000, START + 1_450_000_000
     options = {"start_time_ns": start, "end_time_ns": end, "region": (2, 0, 3, 2), "pixel_share": 0.5, "seed": 3}
     after = convert(native, tmp_path / "converted", **options)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 from helpers.dataset_faults import MOUNTED_APART, OTHER_LENS, Change, set_in
-from helpers.small_datasets import AS_RECORDED, START, parse, write_native
+from helpers.small_datasets import AS_RECORDED, START, parse, read_native, write_native
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 from PIL import Image
 
@@ -18,7 +18,6 @@ from aenerf_ns.dataparsers.native import NativeDataParserConfig
 from aenerf_ns.errors import DataError
 from aenerf_ns.files.tum_trajectory import read_tum_trajectory, write_tum_trajectory
 from aenerf_ns.reconstruction.networks import E2VID, FireNet
-from aenerf_ns.recording.recording import Recording
 
 
 @pytest.fixture
@@ -29,13 +28,9 @@ def data(tmp_path: Path) -> Path:
     return folder
 
 
-def opened(folder: Path) -> Recording:
-    return NativeDataParserConfig(data=folder).setup().recording
-
-
 def test_images_have_poses_of_their_times(data: Path, tmp_path: Path) -> None:
     Reconstruct(data, tmp_path / "out").main()
-    before, after = opened(data), opened(tmp_path / "out")
+    before, after = read_native(data), read_native(tmp_path / "out")
     # 200 events in batches of int(0.35 * 6 * 4).
     views = after.reference_views["train"]
     assert len(views) == 25
@@ -85,7 +80,7 @@ def test_network_reconstructs_with_given_weights(
     state = torch.nn.ModuleDict({made.name_in_file: made}).state_dict()
     torch.save({"state_dict": state}, tmp_path / "weights.pth.tar")
     Reconstruct(data, tmp_path / "out", tmp_path / "weights.pth.tar", events_per_pixel=2.0).main()
-    assert len(opened(tmp_path / "out").reference_views["train"]) == 4
+    assert len(read_native(tmp_path / "out").reference_views["train"]) == 4
 
 
 @pytest.mark.parametrize("is_scaled", [False, True])
@@ -101,7 +96,7 @@ def test_images_without_a_pose_are_left_out(data: Path, tmp_path: Path, capsys: 
     poses = read_tum_trajectory(data / "trajectory_estimated.txt")
     write_tum_trajectory(data / "trajectory_estimated.txt", poses.crop(START, START + 500_000_000))
     Reconstruct(data, tmp_path / "out").main()
-    views = opened(tmp_path / "out").reference_views["train"]
+    views = read_native(tmp_path / "out").reference_views["train"]
     assert 0 < len(views) < 25
     assert all(view.time is not None and view.time <= START + 500_000_000 for view in views)
     assert f"{25 - len(views)} of 25 images are left out" in capsys.readouterr().out
@@ -112,7 +107,7 @@ def test_images_in_a_gap_of_the_true_poses_are_left_out(data: Path, tmp_path: Pa
     (data / "trajectory_ground_truth.txt").write_text("\n".join(lines[:5] + lines[14:]))
     gap = [START + int(1e9 * (float(line.split()[0]) - float(lines[-21].split()[0]))) for line in (lines[4], lines[14])]
     Reconstruct(data, tmp_path / "out").main()
-    views = opened(tmp_path / "out").reference_views["train"]
+    views = read_native(tmp_path / "out").reference_views["train"]
     assert len(views) > 5
     assert not any(view.time is not None and gap[0] + 1e6 < view.time < gap[1] - 1e6 for view in views)
 
@@ -123,7 +118,7 @@ def test_images_of_another_camera_are_left_out(
 ) -> None:
     change(data)
     Reconstruct(data, tmp_path / "out").main()
-    views = opened(tmp_path / "out").reference_views
+    views = read_native(tmp_path / "out").reference_views
     assert [len(views[split]) for split in ("train", "val", "test")] == [25, 0, 0]
     assert "of another camera" in capsys.readouterr().out
 

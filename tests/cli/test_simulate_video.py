@@ -11,6 +11,7 @@ import pytest
 import torch
 from helpers.colmap_stand_in import FOUND_BOX, place_frames
 from helpers.event_file_checks import read
+from helpers.small_datasets import read_native
 from nerfstudio.utils.rich_utils import CONSOLE
 from PIL import Image
 
@@ -123,7 +124,7 @@ def test_video_with_poses_becomes_a_dataset(
 def test_noise_is_added_to_the_given_poses(frames: Path, poses: Path, camchain: Path, tmp_path: Path) -> None:
     options = {"video": frames, "trajectory": poses, "calibration": camchain, "event_camera": "cam0"}
     simulate(tmp_path / "dataset", **options, pose_noise_degrees=1.0)
-    recording = NativeDataParserConfig(data=tmp_path / "dataset").setup().recording
+    recording = read_native(tmp_path / "dataset")
     # Kalibr counts from the center of the first pixel.
     assert (recording.event_camera.cx, recording.event_camera.distortion[0]) == (11.5, -0.1)
     assert recording.ground_truth is not None
@@ -137,7 +138,7 @@ def test_colmap_gives_poses_and_lens(frames: Path, tmp_path: Path, monkeypatch: 
     assert "8 of 10 frames registered" in printed
     assert "The intrinsics were estimated with the poses: focal length 22.0 px" in printed
     assert "the dataset gets a scene box, [[-1.0, -2.0, -3.0], [1.0, 2.0, 3.0]]" in printed
-    recording = NativeDataParserConfig(data=tmp_path / "dataset").setup().recording
+    recording = read_native(tmp_path / "dataset")
     assert (recording.event_camera.fx, recording.event_camera.distortion[0]) == (22.0, 0.01)
     assert recording.intrinsics_origin == "estimated"
     assert recording.scene_box is not None
@@ -150,7 +151,7 @@ def test_colmap_gives_poses_and_lens(frames: Path, tmp_path: Path, monkeypatch: 
     assert report["intrinsics"]["fl_x"] == 22.0
     printed = simulate(tmp_path / "given", video=frames, poses="colmap", intrinsics=(20.0, 21.0, 11.5, 7.5))
     assert "intrinsics were estimated" not in printed
-    recording = NativeDataParserConfig(data=tmp_path / "given").setup().recording
+    recording = read_native(tmp_path / "given")
     assert (recording.event_camera.fy, recording.intrinsics_origin) == (21.0, "given")
 
 

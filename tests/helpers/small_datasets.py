@@ -9,7 +9,9 @@ from PIL import Image
 
 from aenerf_ns.camera.intrinsics import CameraIntrinsics
 from aenerf_ns.camera.trajectory import Trajectory
+from aenerf_ns.dataparsers.native import NativeDataParserConfig
 from aenerf_ns.events.sensor import SensorModel
+from aenerf_ns.recording.recording import Recording
 from aenerf_ns.recording.writer import NativeDatasetWriter
 from helpers.streams import random_stream
 
@@ -56,6 +58,10 @@ def write_ecd(folder: Path) -> Path:
     (folder / "calib.txt").write_text("5 5.5 2.5 1.5 0.01 0 0 0 0\n")
     (folder / "groundtruth.txt").write_text("".join(f"{0.1 * i} {0.02 * i} 0 0 0 0 0 1\n" for i in range(5)))
     return folder
+
+
+def read_native(folder: Path) -> Recording:
+    return NativeDataParserConfig(data=folder).setup().recording
 
 
 AS_RECORDED = {"orientation_method": "none", "center_method": "none", "auto_scale_poses": False}
