@@ -79,7 +79,7 @@ def test_mvsec(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert_same_poses(recording.ground_truth.camera_to_worlds, make_poses())
     # The other file of a run has microseconds.
     write_poses(Path("estimate.txt"), estimated, [repr(float(time * 1e6)) for time in TIMES])
-    with pytest.raises(DataError, match=r"estimate\.txt"):
+    with pytest.raises(DataError, match=r"estimate\.txt: 1600000000000000\.0 is not a time in seconds; write plain"):
         OwnRecordingDataParserConfig(**options, trajectory=Path("estimate.txt")).setup().get_dataparser_outputs("train")
 
 

@@ -172,7 +172,11 @@ def test_refuse_unusable_video(
 @pytest.mark.parametrize("frame_rate", [0.0, -1.0, float("nan"), float("inf"), 1e10])
 def test_refuse_impossible_rate(frame_rate: float, tmp_path: Path) -> None:
     folder = write_folder(tmp_path / "frames", make_frames(2), ["0", "1"])
-    with pytest.raises(DataError, match="frames: "):
+    # At the highest one two frames share a nanosecond.
+    problem = (
+        f"a frame rate of {frame_rate}; give a positive" if frame_rate != 1e10 else "frame 1 is at 0 ns, not after"
+    )
+    with pytest.raises(DataError, match=f"frames: {problem}"):
         open_video(folder, frame_rate)
 
 
