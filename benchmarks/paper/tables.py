@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from itertools import product
 from statistics import fmean, stdev
 from typing import Any
 
@@ -170,11 +171,11 @@ def poses_table(figures: Sequence[Figures]) -> str:
     header = ["", *(f"{speed}: {which} ψ" for speed in speeds for which in ("with", "without"))]
     rows = []
     for name, key in (("RE", "rotation_error_degrees"), ("TE", "translation_error_percent")):
-        cells = [
-            f"{fmean(run['results']['pose_errors'][which][key] for run in _of(corrected, speed=speed)):.3f}"
-            for speed in speeds
-            for which in ("corrected", "estimated")
-        ]
+        cells = []
+        for speed, which in product(speeds, ("corrected", "estimated")):
+            runs = _of(corrected, speed=speed)
+            errors = (run["results"]["pose_errors"][which][key] for run in runs)
+            cells.append(f"{_mean_over_scenes(runs, errors):.3f}")
         rows.append([name, *cells])
     return _markdown(header, rows)
 
@@ -266,9 +267,17 @@ def _mean(figures: Sequence[Figures], metric: str) -> str:
     # Results of earlier versions and of nerfacto have no refined poses.
     refined = [run["results"].get("refined_test_poses", {}).get(metric) for run in figures]
     return " / ".join(
-        f"{fmean(values):.{digits}f}" if values and None not in values else absent
+        f"{_mean_over_scenes(figures, values):.{digits}f}" if values and None not in values else absent
         for values, absent in ((placed, "n/a"), (refined, "-"))
     )
+
+
+def _mean_over_scenes(figures: Sequence[Figures], values: Iterable[float]) -> float:
+    """Return the mean of the runs' values in which a scene counts once, however many seeds it has."""
+    of_scenes: dict[str, list[float]] = {}
+    for run, value in zip(figures, values, strict=True):
+        of_scenes.setdefault(run["scene"], []).append(value)
+    return fmean(map(fmean, of_scenes.values()))
 
 
 def _markdown(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:

@@ -279,6 +279,9 @@ def test_means_are_over_common_runs() -> None:
         of_table = [one for one in figures if one["table"] == table]
         _, _, *rows = cells(make(of_table))
         assert {row[1] for row in rows} == {"25.00 / -"}
+        # More seeds of one scene do not make it count more.
+        more = [{**one, "seed": 2} for one in of_table if one["scene"] == "room"]
+        assert make([*of_table, *more]) == make(of_table)
         # The first row lacks the easy scene, and would look worse than it is.
         partial = [one for one in of_table if one["row"] not in (OURS, "all") or one["scene"] == "room"]
         _, _, *rows = cells(make(partial))
