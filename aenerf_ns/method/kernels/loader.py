@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import subprocess
-from concurrent.futures import ThreadPoolExecutor
+import sys
 from functools import lru_cache
 from importlib import import_module
 from types import ModuleType
@@ -24,21 +24,20 @@ def is_float_in_memory(tensor: Tensor) -> bool:
 @lru_cache
 def try_load(module: str, device: torch.device) -> ModuleType | None:
     """Return a module whose function ``self_test`` computes something on a device, or say why it does not work."""
+    # Nerfstudio's viewer may interrupt its thread at any line. After that, numba can neither be imported nor compile.
+    trace = sys.gettrace()
+    sys.settrace(None)
     try:
-        # Nerfstudio's viewer interrupts its thread at any line. After that, numba can neither be imported nor compile.
-        with ThreadPoolExecutor(1) as thread:
-            return thread.submit(_load, module, device).result()
+        # Imported lazily: every ns-* command imports the model, and numba is slow to import.
+        loaded = import_module(module)
+        loaded.self_test(device)
+        return loaded
     # Triton raises the last two where there is no compiler or no header of Python.
     except (ImportError, RuntimeError, OSError, subprocess.SubprocessError) as error:
         _warn_once(f"[yellow]Plain torch computes what compiled kernels compute faster: {error}.")
         return None
-
-
-def _load(module: str, device: torch.device) -> ModuleType:
-    # Imported lazily: every ns-* command imports the model, and numba is slow to import.
-    loaded = import_module(module)
-    loaded.self_test(device)
-    return loaded
+    finally:
+        sys.settrace(trace)
 
 
 # Modules that need the same library fail for the same reason, which is said once.
