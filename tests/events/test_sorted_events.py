@@ -83,10 +83,11 @@ def test_counts_are_those_of_brute_force_with_random_times_at_both_ends(gaps: tu
     stream = replace(stream, t=EPOCH + 5 * stream.t)
     usable = rng.random((3, 4)) > 0.2
     events = sort_events((stream[i : i + 70] for i in range(0, 400, 70)), window=window, usable=usable)
+    known = np.append(stream.t, np.tile(window.pieces(), (9, 1)))
     compared = 0
     for _ in range(600):
-        # Half of the times are times of events.
-        times = np.where(rng.random(2) < 0.5, rng.choice(stream.t, 2), EPOCH + rng.integers(40, 960, 2))
+        # Half of the times are times of events, or edges of the window and of gaps.
+        times = np.where(rng.random(2) < 0.5, rng.choice(known, 2), EPOCH + rng.integers(40, 960, 2))
         start, end = times.tolist()
         if any(first <= start <= end <= last for first, last in window.pieces()):
             counts = events.counts(start, end)

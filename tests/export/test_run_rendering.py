@@ -91,6 +91,7 @@ def test_a_video_shows_an_image_from_when_it_was_taken(run: TrainedRun) -> None:
 
 def test_a_video_triggers_events_by_learned_thresholds(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     config = make_pipeline_config(tmp_path / "made")
+    set_in("transforms.json", "event_camera", "positive_contrast_threshold", value=0.5)(tmp_path / "made")
     config.model.supervision.learn_contrast_threshold_ratio = True
     made = config.setup(device="cpu", test_mode="test").eval()
     made.model.supervision.raw_ratio.data.fill_(20.0)

@@ -50,7 +50,10 @@ def test_beside_a_crop_box_there_is_the_color_of_the_crop(bounded: bool) -> None
     assert all(torch.isfinite(value).all() for value in outputs.values())
     assert outputs["accumulation"][0, 0] == 0
     assert torch.equal(outputs["rgb"][0, 0], color)
+    assert outputs["depth"][0, 0] == model.config.far_plane
     assert outputs["accumulation"][3, 4] > 0
+    without = model.get_outputs_for_camera(camera, box)["rgb"]
+    torch.testing.assert_close(outputs["rgb"], torch.lerp(color, without, outputs["accumulation"]))
 
 
 def test_between_events_changes_within_the_thresholds_are_right() -> None:
