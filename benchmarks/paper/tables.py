@@ -127,7 +127,9 @@ def peers_parts(figures: Sequence[Figures]) -> list[str]:
         for setting, (peers_column, own_column) in _ORDERS.items():
             wanted = {name: _ROWS_OF[name][own_column if name == _AE_NERF else peers_column] for name in named}
             found = {name: some for name, row in wanted.items() if (some := _of(common, row=row))}
-            means = {name: fmean(run["results"]["psnr"] for run in some) for name, some in found.items()}
+            means = {
+                name: _mean_over_scenes(some, (run["results"]["psnr"] for run in some)) for name, some in found.items()
+            }
             if len(means) > 1:
                 orders.append(f"- here, {setting}: {_order(means)}")
         parts += [
@@ -145,7 +147,7 @@ def _order(values: Mapping[str, float]) -> str:
 
 def _mean_and_spread(figures: Sequence[Figures]) -> str:
     """Return the mean PSNR with test poses placed / refined / placed under the paper's color correction, where that
-    was measured, each with the standard deviation over seeds."""
+    was measured, each with the standard deviation over seeds where these have the same scenes."""
     if not figures:
         return "-"
     parts = []
@@ -159,7 +161,10 @@ def _mean_and_spread(figures: Sequence[Figures]) -> str:
         for run, value in zip(figures, values, strict=True):
             by_seed.setdefault(run["seed"], []).append(value)
         means = [fmean(values) for values in by_seed.values()]
-        parts.append(f"{fmean(means):.2f}" + (f" ± {stdev(means):.2f}" if len(means) > 1 else ""))
+        # Seeds of different scenes would differ as these do.
+        comparable = len(means) > 1 and len(figures) == len(means) * len({run["scene"] for run in figures})
+        spread = f" ± {stdev(means):.2f}" if comparable else ""
+        parts.append(f"{_mean_over_scenes(figures, values):.2f}{spread}")
     # Runs of earlier versions were not evaluated under the network.
     return " / ".join(parts[:-1] if parts[-1] == "-" else parts)
 
