@@ -46,7 +46,7 @@ from aenerf_ns.supervision.event_pairs import PairLossCoefficients, PairSupervis
 
 # ε of the paper's appendix "Model Architecture": the least radiance that is rendered.
 _RADIANCE_EPSILON = 1e-3
-# Beyond some 1.7e7 units, disparity is 0 in float32: the last sample would be at infinity, and count for nothing.
+# Beyond some 1.7e7 units, float32 rounds the sampler's last sample to infinity, where it counts for nothing.
 _MAX_FAR_PLANE = 1e7
 # The error of a display value that has the last color of the error's color map.
 _MAX_SHOWN_ERROR = 0.5
@@ -230,7 +230,7 @@ class AENeRFModel(Model):
         outputs = super().get_outputs_for_camera_ray_bundle(camera_ray_bundle)
         nears, fars = camera_ray_bundle.nears, camera_ray_bundle.fars
         if nears is not None and fars is not None:
-            # Both their ends are 1e10, of which single precision has no disparity: what is rendered there is NaN.
+            # Rays that miss the box start and end at 1e10. In an unbounded scene, what they render is NaN.
             missed = (nears == fars)[..., 0]
             for name, picture in outputs.items():
                 picture[missed] = self.config.far_plane if name == "depth" else 0.0
