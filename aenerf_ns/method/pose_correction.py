@@ -205,9 +205,11 @@ class PoseCorrection(CameraOptimizer):
                 problem = "its poses are from {} to {} ns, and the corrections of poses from {} to {} ns"
                 remedy = "give the poses and the time window of the run, or train again"
                 raise DataError(self.trajectory.source, problem.format(*own, *learned), remedy)
-        # Checkpoints of earlier versions hold no finer spline either.
-        if isinstance(self.twists, TwistSpline) and self.twists.finer is not None:
-            none = torch.zeros_like(self.twists.finer.control_twists)
+        # Checkpoints of earlier versions hold no finer spline either. The framework's pipeline loads once more without
+        # the model's part of a checkpoint, where zeros would replace the finer spline that was loaded.
+        finer = self.twists.finer if isinstance(self.twists, TwistSpline) else None
+        if finer is not None and f"{prefix}twists.control_twists" in state_dict:
+            none = torch.zeros_like(finer.control_twists)
             state_dict.setdefault(f"{prefix}twists.finer.control_twists", none)
         super()._load_from_state_dict(state_dict, prefix, *args)
 

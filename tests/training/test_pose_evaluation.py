@@ -228,6 +228,23 @@ def test_a_trained_run_shows_and_exports_the_corrected_poses(num_views: int, tmp
     assert not start.metadata
 
 
+def test_opening_a_run_keeps_all_that_was_learned(tmp_path: Path) -> None:
+    config = make_pipeline_config(tmp_path / "data")
+    # Every second pose is off by a quarter of the path, so the spline has a finer one.
+    lines = [f"{i / 20} {i / 100} {i % 2 / 20} 0 0 0 0 1" for i in range(21)]
+    (tmp_path / "data" / "trajectory_estimated.txt").write_text("\n".join(lines))
+    config.model.camera_optimizer = PoseCorrectionConfig(mode="spline", rigid_offset=True, clock_offset=0.0)
+    trained, opened = (config.setup(device="cpu", test_mode="test") for _ in range(2))
+    for parameter in trained.parameters():
+        torch.nn.init.normal_(parameter)
+    opened.load_state_dict(trained.state_dict())
+    expected, found = (dict(pipeline.named_parameters()) for pipeline in (trained, opened))
+    assert {name.rpartition("camera_optimizer.")[2] for name in expected} >= {
+        "rigid_offset", "clock_change", "twists.control_twists", "twists.finer.control_twists",
+    }  # fmt: skip
+    assert [name for name, values in expected.items() if not torch.equal(values, found[name])] == []
+
+
 def test_ns_render_shows_training_cameras_where_there_are_no_validation_views(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
