@@ -33,6 +33,7 @@ from aenerf_ns.checking.hypotheses import (
 from aenerf_ns.events.event_images import TILE, accumulate, image_size, sharpest
 from aenerf_ns.events.picture import net_picture
 from aenerf_ns.events.stream import EventStream
+from aenerf_ns.files.event_reader import EventFile
 
 # Permuted together, these columns lose their order within a slice.
 _SHUFFLED_COLUMNS = (("p",), ("x", "y"), ("x", "y", "p"))
@@ -85,24 +86,39 @@ class WarpedSlice:
     points: NDArray[np.float64]
 
 
-def choose_runs(num_events: int, camera: CameraIntrinsics) -> tuple[NDArray[np.int64], int]:
-    """Return where in a recording the runs of consecutive events begin that are looked at, and the length of a run.
+def read_runs(file: EventFile, camera: CameraIntrinsics, window: TimeWindow, num_covered: int) -> list[EventStream]:
+    """Read the runs of consecutive events that are looked at, evenly spread over the events in a time window.
 
-    Runs are as long as the longest slice. A short recording is one run with all its events.
+    The events of a slice are warped as one motion, which a gap between the poses would be in. So runs end at the gaps
+    of the window, and are left out below MIN_EVENTS events.
+
+    Args:
+        file: the events.
+        camera: intrinsics of the event camera.
+        window: times that have poses.
+        num_covered: number of events in the window.
+
+    Returns:
+        Runs as long as the longest slice, as many as there are slices at most, in the order of time; one run with all
+        events of a short recording.
+
+    Raises:
+        DataError: the events cannot be read.
     """
     width, height, _ = image_size(camera.width, camera.height)
-    length = int(_DENSITIES[-1] * width * height)
-    if num_events <= _NUM_SLICES * length:
-        return np.zeros(1, np.int64), num_events
-    return np.linspace(0, num_events - length, _NUM_SLICES).astype(np.int64), length
-
-
-def longest_stretches(runs: list[EventStream], window: TimeWindow) -> list[EventStream]:
-    """Return the stretches of runs between the gaps of a time window, as many as there are slices at most.
-
-    The events of a slice are warped as one motion, which a gap between the poses would be in. Stretches of fewer than
-    MIN_EVENTS events are left out.
-    """
+    begins, length = np.zeros(1, np.int64), num_covered
+    if num_covered > _NUM_SLICES * int(_DENSITIES[-1] * width * height):
+        length = int(_DENSITIES[-1] * width * height)
+        begins = np.linspace(0, num_covered - length, _NUM_SLICES).astype(np.int64)
+    parts: list[list[EventStream]] = [[] for _ in begins]
+    position = 0
+    for chunk in file.tracked("Choosing events"):
+        covered = chunk[window.contains(chunk.t)]
+        for part, begin in zip(parts, begins - position, strict=True):
+            # Indices make a copy: a slice would keep the whole chunk in memory.
+            part.append(covered[np.arange(len(covered))[max(begin, 0) : max(begin + length, 0)]])
+        position += len(covered)
+    runs = [EventStream.concatenate(part) for part in parts if part]
     stretches = [run.between(*piece) for run in runs for piece in window.pieces()]
     longest = sorted((part for part in stretches if len(part) >= MIN_EVENTS), key=len)[-_NUM_SLICES:]
     return sorted(longest, key=lambda part: part.t[0])

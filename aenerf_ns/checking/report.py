@@ -5,10 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 
-import numpy as np
-
 from aenerf_ns.camera.time_window import TimeWindow
-from aenerf_ns.checking.contrast import MIN_EVENTS, WarpedEvents, choose_runs, longest_stretches
+from aenerf_ns.checking.contrast import MIN_EVENTS, WarpedEvents, read_runs
 from aenerf_ns.checking.contrast_checks import check_contrast, check_depth
 from aenerf_ns.checking.event_checks import (
     check_events,
@@ -55,8 +53,8 @@ def check(
     check_steps(result, recording.trajectory, window)
     is_simple = len(result.problems) > num_problems
     # The events are read once more only where there can be enough.
-    runs = _read_runs(recording, window, num_covered) if num_covered >= MIN_EVENTS else []
-    runs = longest_stretches(runs, window)
+    enough = num_covered >= MIN_EVENTS
+    runs = read_runs(recording.event_file, recording.event_camera, window, num_covered) if enough else []
     if not runs:
         check_principal_point(result, recording.event_camera)
         result.figures.append(
@@ -106,18 +104,3 @@ def _check_events(
     check_polarity(result, correlation)
     check_thresholds(result, capture, changes, balance, correlation or 0.0)
     return result, num_posed, num_covered
-
-
-def _read_runs(recording: Recording, window: TimeWindow, num_covered: int) -> list[EventStream]:
-    """Read runs of consecutive events that have a pose, evenly spread over all events that have one."""
-    file, camera = recording.event_file, recording.event_camera
-    begins, length = choose_runs(num_covered, camera)
-    parts: list[list[EventStream]] = [[] for _ in begins]
-    position = 0
-    for chunk in file.tracked("Choosing events"):
-        covered = chunk[window.contains(chunk.t)]
-        for part, begin in zip(parts, begins - position, strict=True):
-            # Indices make a copy: a slice would keep the whole chunk in memory.
-            part.append(covered[np.arange(len(covered))[max(begin, 0) : max(begin + length, 0)]])
-        position += len(covered)
-    return [EventStream.concatenate(part) for part in parts if part]

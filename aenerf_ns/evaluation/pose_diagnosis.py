@@ -114,23 +114,26 @@ def _compare_contrast(run: TrainedRun) -> Comparison | None:
     None where too few events can be read, or get a direction from the lens.
     """
     # Imported lazily: every ns-* command imports this module, and numba is slow to import.
-    from aenerf_ns.checking.contrast import MIN_EVENTS, WarpedEvents
+    from aenerf_ns.checking.contrast import WarpedEvents, read_runs
 
     correction = run.model.camera_optimizer
+    file, camera, window = run.scene.event_file, run.scene.event_camera, run.scene.window
     try:
-        events = run.dataset.timeline
+        num_covered = sum(int(window.contains(chunk.t).sum()) for chunk in file.chunks())
+        runs = read_runs(file, camera, window, num_covered)
     except DataError:
         # A method that trains on images has not read the events. They must not end it before its last checkpoint.
         return None
-    if len(events) < MIN_EVENTS:
+    if not runs:
         return None
     base = correction.trajectory
-    times = base.start + (base.end - base.start) * torch.arange(_NUM_POSES + 1) // _NUM_POSES
-    times = times.unique()
+    num_poses = _NUM_POSES // len(runs)
+    shares = torch.arange(num_poses + 1)
+    times = torch.cat([part.t[0] + (part.t[-1] - part.t[0]) * shares // num_poses for part in runs]).unique()
     with torch.no_grad():
         estimated, corrected = (
             homogeneous(source.pose(base.seconds(times.to(base.times.device))).cpu()) @ OPENCV_TO_OPENGL
             for source in (base, correction)
         )
-    warped = WarpedEvents([events], Trajectory(times, corrected), run.dataset.scene.event_camera)
+    warped = WarpedEvents(runs, Trajectory(times, corrected), camera)
     return warped.compare(Hypothesis("estimated", poses=lambda _: estimated))

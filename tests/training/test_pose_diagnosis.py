@@ -107,6 +107,17 @@ def test_spoiled_poses_are_seen_in_events(dots: Path) -> None:
     assert "turned too far" in figures["summary"]
 
 
+def test_a_long_recording_is_judged_by_consecutive_events(dots: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    pipeline = make_pipeline(dots, "val", pose_correction="spline")
+    whole = diagnosed(pipeline)["contrast_corrected"]
+    # The events are then read in eight runs, and the viewer looks at one of twenty.
+    monkeypatch.setattr("aenerf_ns.checking.contrast._DENSITIES", (1.0,))
+    monkeypatch.setattr("aenerf_ns.recording.dataset._TIMELINE_ROWS", 2000)
+    pipeline = make_pipeline(dots, "val", pose_correction="spline")
+    figures = diagnosed(pipeline)
+    assert figures["contrast_corrected"] == pytest.approx(whole, rel=0.1)
+
+
 @pytest.mark.parametrize("mode", ["spline", "network"])
 def test_still_camera_and_few_events_can_be_diagnosed(tmp_path: Path, mode: str) -> None:
     write_dots(tmp_path / "still", speed=0.0)
