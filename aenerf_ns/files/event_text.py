@@ -23,7 +23,7 @@ from aenerf_ns.events.stream import EventStream
 from aenerf_ns.files.event_reader import EventFile, resolve_sensor_size
 from aenerf_ns.files.event_table import events_from_columns
 from aenerf_ns.files.limits import MAX_LINE
-from aenerf_ns.files.text import NANOSECONDS, TIME_NAME, TimeUnit, require_utf8
+from aenerf_ns.files.text import LABEL, NANOSECONDS, TIME_NAME, TimeUnit, require_utf8
 
 _COLUMNS = "xytp"
 _ALIASES = {"polarity": "p", "pol": "p"}
@@ -78,6 +78,7 @@ def _is_row(line: bytes) -> bool:
 def _parse_names(line: bytes) -> tuple[list[str], TimeUnit | None] | None:
     """Return the names of the columns and the unit of the times that a line states, or None if it does not name all."""
     text = line.decode("utf-8", "replace").lower().lstrip("#% ").replace(" [", "[").replace(" (", "(")
+    text = re.sub(f"^{LABEL}", "", text)
     names = [name.strip().strip('"') for name in (text.split(",") if "," in text else text.split())]
     # Seconds may have their nanoseconds in another column.
     times = [name for name in names if TIME_NAME.fullmatch(name) and "sec" not in name]

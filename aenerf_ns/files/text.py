@@ -19,8 +19,11 @@ TimeUnit = Literal["ns", "us", "ms", "s"]
 NANOSECONDS: dict[TimeUnit, int] = {"ns": 1, "us": 1_000, "ms": 1_000_000, "s": 1_000_000_000}
 UNIT_NAMES = {"ns": "nanoseconds", "us": "microseconds", "ms": "milliseconds", "s": "seconds"}
 
+LABEL = r"(?:(?:columns|data|events|fields|format|header|order|poses)\s*:\s*)?"
+"""What may stand ahead of the names of columns, as in # format: t x y p."""
+
 TIME_NAME = re.compile(
-    r"\W*(?:t|ts|time\w*?|stamp\w*?|secs?|seconds)(?:(?:\s*(?:\[|\((?=\w+\)))|_)(ns|us|ms|s)\b[])]?)?(?!\w)",
+    rf"\W*{LABEL}(?:t|ts|time\w*?|stamp\w*?|secs?|seconds)(?:(?:\s*(?:\[|\((?=\w+\)))|_)(ns|us|ms|s)\b[])]?)?(?!\w)",
     re.IGNORECASE,
 )
 """The name of the column of times. It may state their unit, as timestamp [ns], t (us) and time_us do."""

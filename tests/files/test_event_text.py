@@ -135,6 +135,7 @@ SPELLINGS = {
     "named.txt": "timestamp x y polarity\n" + "".join(f"{t / 1e6:.6f} {x} {y} {p}\n" for x, y, t, p in PLAIN),
     "xytp.txt": "".join(f"{x} {y} {t} {p}\n" for x, y, t, p in PLAIN),
     "comment.txt": "# t y x p\n" + "".join(f"{t} {y} {x} {p}\n" for x, y, t, p in PLAIN),
+    "label.txt": "# events: t[ns] y x p\n" + "".join(f"{t}000 {y} {x} {p}\n" for x, y, t, p in PLAIN),
     "unit_in_comment.txt": "% t [ns] x y p\n" + "".join(f"{t}000 {x} {y} {p}\n" for x, y, t, p in PLAIN),
     "unit_in_comment.csv": "# t[ns],x,y,p\n" + "".join(f"{t}000,{x},{y},{p}\n" for x, y, t, p in PLAIN),
     "unit.csv": "timestamp [ms],x,y,polarity\n" + "".join(f"{t / 1e3},{x},{y},{p}\n" for x, y, t, p in PLAIN),

@@ -36,6 +36,7 @@ POSES = {
     "w last by units, and a remark": f"# t x y z q_i q_j q_k q_r (unit)\n0.492 {POSE}\n0.496 {POSE}\n",
     "w first by numbers": f"t,x,y,z,q0,q1,q2,q3\n{W_FIRST}",
     "w first with dots": f"# t x y z q.w q.x q.y q.z\n{W_FIRST}",
+    "w first behind a label": f"# Format: timestamp [s] tx ty tz qw qx qy qz\n{W_FIRST}",
     "w first behind secs": f"# secs, tx, ty, tz, qw, qx, qy, qz\n{W_FIRST}",
     "w first behind utime": f"#utime tx ty tz qw qx qy qz\n# eight words of a remark that names nothing\n{W_FIRST}",
     "names that state the unit": f"stamp_ms, tx, ty, tz, qx, qy, qz, qw\n492 {POSE}\n496 {POSE}\n",

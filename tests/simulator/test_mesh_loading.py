@@ -34,15 +34,34 @@ def load_obj(folder: Path, text: str, materials: str = "") -> Mesh:
     return load_mesh(folder / "a.obj", False)
 
 
-def test_refuse_colors_of_a_glb_that_would_be_cut(tmp_path: Path) -> None:
-    part = {"attributes": {"POSITION": 0, "COLOR_0": 1}}
-    accessors = [{"componentType": 5126}, {"componentType": 5123}]
-    header = json.dumps({"asset": {"version": "2.0"}, "meshes": [{"primitives": [part]}], "accessors": accessors})
-    content = header.encode()
+MOVED = {"extensions": {"KHR_texture_transform": {"offset": [0, 0], "scale": [2, 2]}}}
+
+
+@pytest.mark.parametrize(
+    ("part", "number", "texture", "problem"),
+    [
+        ({}, 5123, None, "colors of 16 bits on a surface without a material; give it one"),
+        ({"material": 0}, 5123, {}, "texture coordinates that are integers; export them as decimals"),
+        ({"material": 0}, 5126, {"texCoord": 1}, "a second set of texture coordinates; keep one"),
+        ({"material": 0}, 5126, MOVED, "a texture that is moved or scaled on its surface; bake it"),
+        ({"mode": 6}, 5126, None, "fans of triangles; export the mesh as triangles"),
+        ({"indices": 2}, 5126, None, "sparse values; export the mesh again"),
+    ],
+)
+def test_refuse_a_glb_that_would_look_different(
+    part: dict, number: int, texture: dict | None, problem: str, tmp_path: Path
+) -> None:
+    header = {
+        "asset": {"version": "2.0"},
+        "meshes": [{"primitives": [{"attributes": {"POSITION": 0, "COLOR_0": 1, "TEXCOORD_0": 1}, **part}]}],
+        "accessors": [{"componentType": 5126}, {"componentType": number}, {"componentType": 5125, "sparse": {}}],
+        "materials": [] if texture is None else [{"pbrMetallicRoughness": {"baseColorTexture": texture}}],
+    }
+    content = json.dumps(header).encode()
     (tmp_path / "a.glb").write_bytes(
         struct.pack("<4sIII4s", b"glTF", 2, 20 + len(content), len(content), b"JSON") + content
     )
-    with pytest.raises(DataError, match=r"a.glb: colors of 16 bits on a surface without a material; give it one"):
+    with pytest.raises(DataError, match=rf"a.glb: {problem}"):
         load_mesh(tmp_path / "a.glb", True)
 
 
@@ -146,6 +165,12 @@ def test_obj_keeps_its_texture_beside_a_face_without_coordinates(tmp_path: Path)
 def test_obj_with_tabs_leading_zeros_and_a_byte_order_mark(tmp_path: Path) -> None:
     mesh = load_obj(tmp_path, "\ufeffv\t0 0 0\n\tv 2\t0 0\nv\t0 2 0\nf\t01\t02 03\n")
     assert mesh.vertices[mesh.faces].tolist() == [[[0, 0, 0], [2, 0, 0], [0, 2, 0]]]
+
+
+def test_comments_of_an_obj_say_nothing(tmp_path: Path) -> None:
+    text = "# mtllib gone.mtl\nmtllib a.mtl\nv 0 0 0\nv 2 0 0\nv 0 2 0\nusemtl red\nf 1 2 3\n # usemtl green\nf 1 3 2\n"
+    mesh = load_obj(tmp_path, text, "newmtl red\nKd 1 0 0\nnewmtl green\nKd 0 1 0\n")
+    assert mesh.color[mesh.faces].tolist() == [[[1, 0, 0]] * 3] * 2
 
 
 TRIANGLE = "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n"

@@ -28,8 +28,8 @@ _MAX_BYTES = 1 << 30
 _UNCOLORED = 0.5
 """Albedo of a surface that has no color in its file."""
 _REMEDY = "export the mesh again"
-# The number of a type in glTF.
-_UINT16 = 5123
+# Numbers of glTF: of types, and of a fan of triangles.
+_UINT16, _FLOAT32, _FAN = 5123, 5126, 6
 
 
 def load_mesh(path: Path, y_up: bool, gloss: Mapping[str, Gloss] | None = None) -> Mesh:
@@ -132,7 +132,8 @@ def _read_obj(path: Path, content: bytes) -> tuple[bytes, str | None, set[str]]:
     """Return an .obj file that trimesh reads as it is meant, its material file, and the materials that it uses."""
     text = content.decode("utf-8-sig", errors="replace").replace("\r\n", "\n").replace("\\\n", " ")
     # trimesh passes over lines that begin with a blank, or have tabs.
-    text = re.sub(r"^ +", "", text.replace("\t", " "), flags=re.MULTILINE)
+    # It takes words in comments for commands.
+    text = re.sub(r"^ *#.*|^ +", "", text.replace("\t", " "), flags=re.MULTILINE)
     libraries = [name.strip() for name in re.findall(r"^mtllib(.*)", text, re.MULTILINE)]
     used = {name.strip() for name in re.findall(r"^usemtl(.*)", text, re.MULTILINE)}
     if len(libraries) > 1:
@@ -279,25 +280,59 @@ def _linear_colors(values: Any, is_linear: bool) -> Array:
 
 
 def _require_plain_glb(path: Path, content: bytes) -> None:
-    """Raise a DataError for content that trimesh would ignore without a word."""
+    """Raise a DataError for content that trimesh would ignore, or take for something else, without a word."""
     try:
         magic, _, _, length, kind = struct.unpack_from("<4sIII4s", content)
         header = json.loads(content[20 : 20 + length])
         if magic != b"glTF" or kind != b"JSON":
             raise ValueError("no glTF 2.0 header")
         required = [name for name in header.get("extensionsRequired", []) if not name.startswith("KHR_materials")]
-        has_unknown_textures = any("source" not in texture for texture in header.get("textures", []))
-        parts = [part for mesh in header.get("meshes", []) for part in mesh["primitives"] if "material" not in part]
-        colors = [part["attributes"]["COLOR_0"] for part in parts if "COLOR_0" in part["attributes"]]
-        has_cut_colors = any(header["accessors"][index]["componentType"] == _UINT16 for index in colors)
+        parts = [part for mesh in header.get("meshes", []) for part in mesh["primitives"]]
+        # Of each part: what is read of its values, by name. What moves a mesh is often sparse, and is not read.
+        read = [
+            {name: header["accessors"][index] for name, index in part["attributes"].items()}
+            | ({"indices": header["accessors"][part["indices"]]} if "indices" in part else {})
+            for part in parts
+        ]
+        colors = [
+            of["COLOR_0"] for of, part in zip(read, parts, strict=True) if "COLOR_0" in of and "material" not in part
+        ]
+        mapped = [of["TEXCOORD_0"] for of in read if "TEXCOORD_0" in of]
+        materials = [material.get("pbrMetallicRoughness", {}) for material in header.get("materials", [])]
+        textures = [material.get("baseColorTexture", {}) for material in materials]
+        moves = [texture.get("extensions", {}).get("KHR_texture_transform", {}) for texture in textures]
+        faults = [
+            (required, f"needs {', '.join(required)}", "export the mesh without extensions or compression"),
+            (
+                any(values["componentType"] == _UINT16 for values in colors),
+                "colors of 16 bits on a surface without a material",
+                "give it one, or colors of 8 bits",
+            ),
+            (
+                any("source" not in texture for texture in header.get("textures", [])),
+                "textures of an unknown kind",
+                "export the mesh with PNG or JPEG textures",
+            ),
+            (
+                any(values["componentType"] != _FLOAT32 for values in mapped),
+                "texture coordinates that are integers",
+                "export them as decimals",
+            ),
+            (any(texture.get("texCoord") for texture in textures), "a second set of texture coordinates", "keep one"),
+            (
+                # The values that move nothing.
+                any(value not in (0, [0, 0], [1, 1]) for move in moves for value in move.values()),
+                "a texture that is moved or scaled on its surface",
+                "bake it, or change the texture coordinates",
+            ),
+            (any(part.get("mode") == _FAN for part in parts), "fans of triangles", "export the mesh as triangles"),
+            (any("sparse" in values for of in read for values in of.values()), "sparse values", _REMEDY),
+        ]
     except (struct.error, LookupError, ValueError, AttributeError, TypeError) as error:
         raise DataError(path, f"not a binary glTF file ({error})", "export the mesh as .glb") from error
-    if required:
-        raise DataError(path, f"needs {', '.join(required)}", "export the mesh without extensions or compression")
-    if has_cut_colors:
-        raise DataError(path, "colors of 16 bits on a surface without a material", "give it one, or colors of 8 bits")
-    if has_unknown_textures:
-        raise DataError(path, "textures of an unknown kind", "export the mesh with PNG or JPEG textures")
+    for is_found, problem, remedy in faults:
+        if is_found:
+            raise DataError(path, problem, remedy)
 
 
 def triangulate(corners: Array) -> NDArray[np.int64]:
