@@ -43,7 +43,7 @@ def extract_mesh(run: TrainedRun, num_views: int, resolution: int, encoding: Ima
         A mesh with vertex colors, in the recording's world and units.
 
     Raises:
-        DataError: the views see no surface, or no two of them the same one.
+        DataError: the views see no surface, or no two of them the same one, or the scene lies too far from the origin.
     """
     open3d = load_open3d()
     given = run.recording.event_camera
@@ -66,6 +66,11 @@ def extract_mesh(run: TrainedRun, num_views: int, resolution: int, encoding: Ima
     low, high = _choose_box(run, points[depths > 0].numpy())
     depths[((points < torch.from_numpy(low)) | (points > torch.from_numpy(high))).any(-1)] = 0
     voxel = float((high - low).max()) / resolution
+    # Open3D and mesh files hold single precision, which cannot tell voxels apart there.
+    farthest_corner = np.float32(np.abs([low, high]).max())
+    if np.spacing(farthest_corner) > voxel / 8:
+        problem = f"its scene lies {farthest_corner:.3g} units from the origin of its world, too far for a mesh"
+        raise DataError(run.data, problem, "subtract a constant from the positions of its poses, and train again")
     core, image = open3d.core, open3d.t.geometry.Image
     # Blocks are only kept around surfaces. Open3D's other sparse volume finds no block in some of its releases.
     grid = open3d.t.geometry.VoxelBlockGrid(

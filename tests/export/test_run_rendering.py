@@ -192,3 +192,13 @@ def test_mesh_is_in_recording_units(run: TrainedRun, monkeypatch: pytest.MonkeyP
     assert (linear.visual.vertex_colors[is_near] == [255, 55, 0, 255]).mean() > 0.9
     with pytest.raises(DataError, match=r"no two of 1 views see the same surface in voxels .*; give a higher --num"):
         mesh.extract_mesh(run, num_views=1, resolution=48)
+    # The coordinates of a map.
+    far, poses = torch.tensor([5e5, 5e6, 0.0]), mesh.corrected_poses
+    monkeypatch.setattr(
+        mesh, "corrected_poses", lambda *given: poses(*given) + torch.nn.functional.pad(far[:, None], (3, 0, 0, 1))
+    )
+    center = center + far.numpy()
+    with pytest.raises(
+        DataError, match=r"its scene lies 5e\+06 units from the origin of its world, too far for a mesh"
+    ):
+        mesh.extract_mesh(run, num_views=5, resolution=48)
