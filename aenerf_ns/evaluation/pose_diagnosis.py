@@ -129,7 +129,8 @@ def _compare_contrast(run: TrainedRun) -> Comparison | None:
     base = correction.trajectory
     num_poses = _NUM_POSES // len(runs)
     shares = torch.arange(num_poses + 1)
-    times = torch.cat([part.t[0] + (part.t[-1] - part.t[0]) * shares // num_poses for part in runs]).unique()
+    spans = [(int(part.t[0]), int(part.t[-1])) for part in runs]
+    times = torch.cat([start + (end - start) * shares // num_poses for start, end in spans]).unique()
     with torch.no_grad():
         estimated, corrected = (
             homogeneous(source.pose(base.seconds(times.to(base.times.device))).cpu()) @ OPENCV_TO_OPENGL
